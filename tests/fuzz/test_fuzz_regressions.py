@@ -135,7 +135,7 @@ def test_metadata_with_an_invalid_end_is_rejected(last: str, tmp_path: Path) -> 
         f"duration: {{nanoseconds: {last}}}}}"
     )
     (tmp_path / METADATA).write_text(text)
-    with refusing(r"metadata\.yaml: found .*, expected that of rosbag2"):
+    with refusing(r"metadata\.yaml: found .*, expected the metadata.yaml that rosbag2 writes"):
         read_bag_metadata(tmp_path)
 
 

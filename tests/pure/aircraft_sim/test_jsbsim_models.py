@@ -353,7 +353,8 @@ def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Pa
     condition = FlightCondition(str(model), 46.3, 1219.2, STEP_NS)
     with pytest.raises(
         FlightEnded,
-        match=rf"cannot be loaded: no .xml of own_engine is in {tmp_path}/Engines or .*/engine$",
+        match=r"cannot be loaded: .*found no file own_engine.xml, expected it in "
+        rf"{tmp_path}/Engines or .*/engine$",
     ):
         trim_solution(condition)
 

@@ -22,7 +22,7 @@ from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup import fly as flying
-from flight_bringup.fly import _follow_real_time, _Span, last
+from flight_bringup.fly import _follow_real_time, _Span, run_to_end
 from flight_bringup.interrupt import DeferredInterrupt, handle_signals, interrupt
 from flight_bringup.processes import FIRST_U
 from flight_core.outcome import Outcome, Refusal, ended_early
@@ -944,7 +944,7 @@ def followed(
     monitor: "FlightMonitor",
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = np.inf,
-    begins: bool = False,
+    must_begin: bool = False,
 ) -> Outcome:
     """The outcome of a flight of osprey_gust, 60 s.
 
@@ -954,13 +954,13 @@ def followed(
     monotonic_ns = lambda: round(1e9 * vars(flying)["time"].monotonic())  # noqa: E731 - a stand-in
     vars(monitor)["clock"] = SimpleNamespace(monotonic_ns=monotonic_ns)
     vars(processes).update(scenario=scenario, monitor=monitor)
-    span = _Span(scenario, processes, monitor, begins=begins)
+    span = _Span(scenario, processes, monitor, must_begin=must_begin)
     steps = _follow_real_time(processes, lambda t, text: None, announce, engaged_for, span)
-    return last(steps, pause=vars(flying)["time"].sleep)
+    return run_to_end(steps, pause=vars(flying)["time"].sleep)
 
 
 @pytest.mark.parametrize(
-    "begins, until, end, outcome",
+    "must_begin, until, end, outcome",
     [
         (False, 60.0, 60.0, "completed"),
         (False, 59.0, 64.0, "completed"),
@@ -971,11 +971,11 @@ def followed(
     ],
 )
 def test_flight_ends_once_log_holds_it(
-    begins: bool, until: float | None, end: float, outcome: str, monkeypatch: pytest.MonkeyPatch
+    must_begin: bool, until: float | None, end: float, outcome: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A log that stops is waited for for 5 s.
 
-    With an autopilot (not `begins`) u may end, or never begin.
+    With an autopilot (not `must_begin`) u may end, or never begin.
     """
     now = [0.0]
 
@@ -998,7 +998,7 @@ def test_flight_ends_once_log_holds_it(
     )
     monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=recorded)
     sentence = followed(
-        cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins
+        cast("FlightProcesses", processes), cast("FlightMonitor", monitor), must_begin=must_begin
     )
     assert str(sentence) == outcome
     assert now[0] == approx(end, abs=0.1)
@@ -1034,7 +1034,7 @@ def test_flight_that_does_not_begin_says_which_signal_is_missing(
         recorded=lambda: None,
     )
     sentence = followed(
-        cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=True
+        cast("FlightProcesses", processes), cast("FlightMonitor", monitor), must_begin=True
     )
     assert str(sentence) == f"never flew: {outcome}"
     assert now[0] == approx(FIRST_U, abs=0.1)

@@ -37,8 +37,8 @@ from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.summary import (
     RecordedFlight,
     command_results,
+    coverage_suffix,
     summarise,
-    taken_over,
 )
 from flight_analysis.report.tables import EventInterval, flight_tables
 from flight_bringup.fleet import Member, MemberFlight
@@ -110,7 +110,7 @@ def test_whole_log_lacks_nothing(
         "internals": 201,
         "pose": 101,
     }
-    assert [taken_over(figures, table) for table in TABLES] == ["", "", ""]
+    assert [coverage_suffix(figures, table) for table in TABLES] == ["", "", ""]
     result = replayed(whole, capsys)
     assert (result["checked"], result["ticks"], result["expected"], result["notes"]) == (
         201,
@@ -144,7 +144,7 @@ def test_every_command_says_what_log_lacks(
     assert any(sentence.startswith(f"log incomplete: {topic} ") for sentence in shortfalls)
     for table in TABLES:
         if json.dumps(summary[table]) != json.dumps(figures[table]):
-            assert taken_over(summary, table).startswith(", over ")
+            assert coverage_suffix(summary, table).startswith(", over ")
     flight = Flight(log)
     while flight.update():
         pass

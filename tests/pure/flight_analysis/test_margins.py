@@ -106,7 +106,7 @@ def test_delay_margin_is_found_from_another_one(near: float) -> None:
 def test_law_is_linearised_at_all_values_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     law = find_scenario("osprey_observer").controller.tuned_law()
     at_once = linear_law(law, 4, 0.01)
-    monkeypatch.setattr(linear_loop, "_takes_columns", lambda _: False)
+    monkeypatch.setattr(linear_loop, "_has_columns", lambda _: False)
     for matrix, column_by_column in zip(at_once, linear_law(law, 4, 0.01), strict=True):
         assert_array_equal(matrix, column_by_column)
 

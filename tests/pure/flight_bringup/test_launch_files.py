@@ -648,9 +648,9 @@ def test_flight_around_an_aircraft_and_a_reference_model_of_ones_own(tmp_path: P
     assert Path(recorder["scenario_file"]) == file  # what flies
     attached = {Path(each).name: Path(each) for each in recorder["attach"]}
     parameters = attached["parameters.yaml"]
-    unflown = re.findall(r"^# did not fly: (\w+); ", parameters.read_text(), re.MULTILINE)
+    unflown = re.findall(r"^# not started: (\w+), ", parameters.read_text(), re.MULTILINE)
     assert unflown == ["aircraft", "reference_model"]
-    assert attached["airframe.yaml"].read_text().startswith("# did not fly: aircraft; ")
+    assert attached["airframe.yaml"].read_text().startswith("# not started: aircraft, ")
     assert load_scenario(parameters).controller.delay == 0.01  # it can fly again
     with refusing("aircraft: found false in lockstep, expected true"):
         started("fly", runs=tmp_path, aircraft="false", lockstep="true")

@@ -218,6 +218,6 @@ def test_folder_in_the_place_of_the_link_to_the_run_is_refused_before_the_flight
     tmp_path: Path,
 ) -> None:
     (tmp_path / "latest").mkdir()
-    with refusing("latest: found a folder, expected no file of this name: it becomes a link"):
+    with refusing("latest: found a file or folder, expected none: this name is for a link"):
         new_run(find_scenario("osprey_gust"), tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["latest"]

@@ -713,7 +713,10 @@ def test_two_systems_that_flew_are_refused_but_for_the_one_that_the_user_names(
 ) -> None:
     later = Flight([stamp + 10_000 for stamp in flight.stamp_us], -flight.y, -flight.u)
     path, _ = two_systems(tmp_path, flight, later)
-    sentence = "the log: found motion of the systems 7 and 1, expected --system 7 or --system 1"
+    sentence = (
+        "the log: found several systems that moved, 7 and 1, "
+        "expected a choice: --system 7 or --system 1"
+    )
     assert str(imported(path, tmp_path / "bag").exception) == sentence
     assert "--system: found 3, expected one of 7 and 1" in str(
         imported(path, tmp_path / "bag", "--system", "3").exception
@@ -859,8 +862,8 @@ def test_airspeed_of_a_primary_that_changes_in_flight_is_that_of_each_instant(
         Pri=(0, 0),
     )
     assert (
-        "found ARSP of 0 and 1, which differ, expected --instance ARSP=0 or --instance ARSP=1"
-        in str(imported(path, tmp_path / "no").exception)
+        "found different instances 0 and 1 of ARSP, expected a choice: --instance ARSP=0 or "
+        "--instance ARSP=1" in str(imported(path, tmp_path / "no").exception)
     )
     assert imported(path, tmp_path / "bag", "--instance", "ARSP=1").exit_code == 0
     rows = [
@@ -900,7 +903,9 @@ def test_gyroscope_is_one_that_is_used_and_two_that_differ_are_refused(
     assert log.taken == (Taken("IMU", (1,), (0, 1), Reason.MOVES),)
     assert log.tables["IMU"].fields["GyrY"] == approx(rates[:, 1], abs=1e-6)
     turned = sensors(tmp_path / "b.bin", flight, "IMU", {}, rates, -rates)
-    with refusing("found IMU of 0 and 1, which differ, expected --instance IMU=0 or"):
+    with refusing(
+        "found different instances 0 and 1 of IMU, expected a choice: --instance IMU=0 or"
+    ):
         read_vehicle_log(turned)
     equal = sensors(tmp_path / "c.bin", flight, "IMU", {}, rates, rates + 0.001)
     assert read_vehicle_log(equal).taken == (Taken("IMU", (0,), (0, 1), Reason.AGREES),)
@@ -1180,7 +1185,7 @@ def test_airspeed_without_a_sensor_in_use_is_the_estimate_of_the_autopilot(
     assert imported(path, tmp_path / "dead", "--instance", "ARSP=0").exit_code == 0
     path.write_bytes(path.read_bytes().replace(b"CTUN", b"XTUN", 1))
     refused = str(imported(path, tmp_path / "no").exception)
-    assert f"found no airspeed sensor in use ({reason}), expected its estimate in CTUN" in refused
+    assert f"found no airspeed sensor in use ({reason}), expected an estimate of the" in refused
 
 
 def test_damaged_bytes_cost_what_they_hold_and_print_nothing(

@@ -217,8 +217,8 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
     "tape of a log": (
         lambda run: api.summarise(run.tape),
         (
-            "scenario: found none on the tape of a log, expected summarise(run.tape, "
-            "recorded_scenario(run))"
+            "scenario: found no scenario for the tape of a log, expected one as the second "
+            "argument, such as recorded_scenario(run)"
         ),
     ),
     "signal as samples": (lambda tape: api.error_metrics(tape["y"]), "errors: found Signal("),

@@ -24,7 +24,7 @@ from rise_di_controller.learning.learned_channels import (
     authority,
     authority_names,
     coupled,
-    outputs_without,
+    outputs_given_up,
     with_channels_of,
     with_fallback,
     without_models,
@@ -404,11 +404,11 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     assert isinstance(fallen, RiseDiConfig)
     longitudinal = [name in {"q", "V"} for name in START.outputs]
     assert fallen == without_models(START, parameters, ["q", "V"])
-    assert outputs_without(fallen) == ("q", "V")
+    assert outputs_given_up(fallen) == ("q", "V")
     flight.now_ns += 10_000_000
     logged = dict(zip(flight.controller.names, flight.engage().internals.tolist(), strict=True))
     assert [logged[f"given_up.{name}"] for name in ("q", "V", "p", "r")] == [1.0, 1.0, 0.0, 0.0]
-    assert outputs_without(without_models(START, fallen, ["r", "p"])) == START.outputs
+    assert outputs_given_up(without_models(START, fallen, ["r", "p"])) == START.outputs
     assert changes(fallen, with_fallback(START, parameters, longitudinal)) == {
         "learn.without": None
     }
@@ -537,7 +537,7 @@ def test_part_has_no_further_model_after_its_second_fallback(
         diverge(flight, monkeypatch, "p", "r")
         flight.receive(faded(time))
         flight.step()
-    assert outputs_without(flight.controller.parameters) == START.outputs
+    assert outputs_given_up(flight.controller.parameters) == START.outputs
     assert flight.sentences[-2].endswith(
         "in p, r to the end of the engagement: p diverges again and r diverges again"
     )
@@ -554,7 +554,7 @@ def test_part_has_no_further_model_after_its_second_fallback(
         flight.step()
         assert acting_inputs(flight.controller.parameters) == START.inputs  # type: ignore[arg-type]
         diverge(flight, monkeypatch, name)
-    assert outputs_without(flight.controller.parameters) == ()
+    assert outputs_given_up(flight.controller.parameters) == ()
 
 
 def test_margin_of_a_proposal_is_certified_to_its_end() -> None:

@@ -108,7 +108,7 @@ def test_shells_of_page_run_to_the_last_command(
     log = checkout / "runs" / "latest"
 
     def largest() -> tuple[int, float, float]:
-        """Samples of y, and the largest abs(q) of y and of y_m."""
+        """Return the number of samples of y, and the largest abs(q) of y and of y_m."""
         tape = read_run(log).tape
         q, reference = (abs(tape[topic]["q"]) for topic in ("y", "y_m"))
         return len(q), max(q), max(reference)

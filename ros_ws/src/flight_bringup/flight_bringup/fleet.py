@@ -18,7 +18,7 @@ from flight_analysis.closed_loop.scenario import Scenario, require_guidable
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_analysis.report.run_folder import new_run
 from flight_analysis.report.separation import SEPARATION
-from flight_bringup.fly import POLL_PERIOD, Steps, as_file, follow
+from flight_bringup.fly import POLL_PERIOD, Steps, follow, with_file
 from flight_bringup.graph import FIRST_STAGE, LEAD, absolute_namespace, second_stage
 from flight_bringup.interrupt import DeferredInterrupt, handle_signals
 from flight_bringup.processes import FlightProcesses, start_instants
@@ -262,7 +262,7 @@ class _Flight:
         self.progress(0.0, "starting")
         try:
             self.processes = FlightProcesses(
-                as_file(self.member.scenario, self.run, absolute_namespace(self.member.name)),
+                with_file(self.member.scenario, self.run, absolute_namespace(self.member.name)),
                 self.run,
                 self.monitor,
                 lockstep=fleet.lockstep,

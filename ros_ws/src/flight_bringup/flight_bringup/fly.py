@@ -53,8 +53,8 @@ NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # a number in a reason, such a
 STAMP_ERROR = 1e-5  # s, rounding error of a time of day as a float
 
 STALL_TIMEOUT = 40.0
-"""Time without progress after which a lockstep flight ends, s. If contact with a node is lost, it
-ends within three seconds."""
+"""Time without progress after which a lockstep flight ends, s. If contact with a node is lost, the
+flight ends within three seconds."""
 
 
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
@@ -86,11 +86,12 @@ def fly_over_topics(
     `announce` is called with a line when the phase of an engagement or its reason changes, except
     if only a number in the reason changes. It also gets a line on what became of a learner's
     proposal, and on a process that had to be killed. If `engaged_for`, s, is given, the flight ends
-    this long after its first engagement, or when the engagement ends. It also ends if the law is
-    not engaged yet when only `engaged_for` of the duration is left.
+    this long after its first engagement, or when the engagement ends. If the law is
+    not engaged by the duration minus `engaged_for`, the flight ends, too, because the engagement
+    would be too short.
 
-    The outcome is COMPLETED, LANDED, INTERRUPTED (by Ctrl-C, SIGTERM or SIGHUP), or names the
-    process that ended early.
+    The outcome is COMPLETED, LANDED or INTERRUPTED (by Ctrl-C, SIGTERM or SIGHUP), or says why the
+    flight did not begin or ended early.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -120,7 +121,7 @@ def fly_over_topics(
         ):
             refusal = processes.begin()
             steps = follow(processes, progress, announce, engaged_for)
-            processes.outcome = refusal or last(steps, interrupt.pause)
+            processes.outcome = refusal or run_to_end(steps, interrupt.pause)
             return processes.outcome
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -128,7 +129,7 @@ def fly_over_topics(
         return never_flew(str(error))
 
 
-def last(steps: Steps, pause: Callable[[float], None]) -> Outcome:
+def run_to_end(steps: Steps, pause: Callable[[float], None]) -> Outcome:
     """Follow a flight to its last step, with a `pause` between steps, and return the outcome."""
     while True:
         try:
@@ -145,19 +146,19 @@ def follow(
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = math.inf,
 ) -> Steps:
-    """Return the steps by which a flight that has begun is followed, one every POLL_PERIOD.
+    """Return the steps that follow a started flight. The caller takes one every POLL_PERIOD.
 
     Each step checks the flight once. The arguments have the same meaning as for `fly_over_topics`.
     """
     if processes.lockstep:
         return _follow_lockstep(processes, progress, announce)
     scenario = processes.scenario
-    begins = (
+    must_begin = (
         processes.autopilot is None
         and scenario.controller.autostart
         and scenario.controller.start_active
     )
-    span = _Span(scenario, processes, processes.monitor, begins=begins)
+    span = _Span(scenario, processes, processes.monitor, must_begin=must_begin)
     return _follow_real_time(processes, progress, announce, engaged_for, span)
 
 
@@ -180,7 +181,7 @@ class _Span:
 
     A flight has begun when the aircraft takes u. It is over when the log holds y, y_m and u up to
     the end of the flight. With an autopilot, or with a controller that a user activates, there may
-    never be a u. In these cases `begins` is False, and the phase is OPEN to the end.
+    never be a u. In these cases `must_begin` is False, and the phase is OPEN to the end.
     """
 
     def __init__(
@@ -189,14 +190,16 @@ class _Span:
         processes: FlightProcesses,
         monitor: "FlightMonitor",
         *,
-        begins: bool,
+        must_begin: bool,
     ) -> None:
         self._duration = scenario.flight.duration
         self._processes = processes
         self._monitor = monitor
         self._until = -math.inf  # s, flight time up to which the log holds y, y_m and u
-        self._last_change = 0.0 if begins else -math.inf  # s, flight time of the last change
-        self._phase = _Phase.WAITING if begins else _Phase.OPEN
+        self._last_change = (
+            0.0 if must_begin else -math.inf
+        )  # s, flight time at which _until last grew
+        self._phase = _Phase.WAITING if must_begin else _Phase.OPEN
 
     def note_u(self) -> None:
         """Note that the controller has published u."""
@@ -204,7 +207,7 @@ class _Span:
             self._phase = _Phase.PUBLISHED
 
     def outcome(self, t: float) -> Outcome | None:
-        """Return the outcome if the log has the whole flight or no longer grows, else None."""
+        """Return the outcome after a flight whose log is whole or no longer grows, else None."""
         if (
             stamp := self._monitor.recorded()
         ) is not None and stamp - self._processes.start_time > self._until:
@@ -220,8 +223,8 @@ class _Span:
             return COMPLETED
         return log_ends_at(self._until, self._duration)
 
-    def failed(self, t: float) -> Outcome | None:
-        """Return the outcome of a flight that should have begun by now but has not, else None."""
+    def check_begin(self, t: float) -> Outcome | None:
+        """Note whether the aircraft takes u, and return the outcome if it should but does not."""
         if self._phase.is_awaited and self._processes.is_flying():
             self._phase = _Phase.FLYING
         if not self._phase.is_awaited or t < FIRST_U:
@@ -251,7 +254,7 @@ def _follow_real_time(
     while True:
         _announce_learned(processes, processes.start_time, announce)
         t = seconds(monitor.clock.monotonic_ns()) - processes.started
-        if outcome := span.outcome(t) or processes.ended() or span.failed(t):
+        if outcome := span.outcome(t) or processes.ended() or span.check_begin(t):
             return outcome
         for phase, why in monitor.engagement():
             line = f"{phase}{f': {why}' if why else ''}"
@@ -399,7 +402,7 @@ def fly_and_report(
         The flight, and the paths of log and report.
 
     Raises:
-        ParameterError: Nothing can be written, or the flight ended before the first sample.
+        ParameterError: The folder cannot be written, or the flight ended before the first sample.
 
     Examples:
         >>> flight = rise_di.fly(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -414,14 +417,14 @@ def fly_and_report(
     )
     found = find_scenario(scenario)
     run = new_run(found, as_path(runs, "runs", "the path of a folder"))
-    flown = as_file(found, run)
+    flown = with_file(found, run)
     outcome = fly_in_process(
         flown, run, lambda t, _: None if progress is None else progress(t), learn
     )
     return write_report(run, outcome)
 
 
-def _is_its_file(scenario: Scenario) -> bool:
+def _equals_its_file(scenario: Scenario) -> bool:
     """Return whether a scenario still equals the content of its file."""
     try:
         return load_scenario(scenario.path) == scenario
@@ -429,12 +432,13 @@ def _is_its_file(scenario: Scenario) -> bool:
         return False
 
 
-def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
+def with_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     """Return the scenario with a parameter file that the nodes in the namespace can read.
 
-    If the scenario equals its own file, `as_flown` gives the result. If it does not, the scenario
-    is written to a new file in the folder of the run. Raises ParameterError.
+    If the scenario equals its own file, `as_flown` adapts this file if necessary. If it does not,
+    the scenario is written to a new file in the folder of the run. Raises ParameterError if no file
+    can be written.
     """
-    if _is_its_file(scenario):
+    if _equals_its_file(scenario):
         return as_flown(scenario, run, namespace)
     return save_scenario(scenario, run / f"{scenario.name}.yaml")

@@ -21,7 +21,7 @@ from launch_ros.actions import Node
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_parameters
 from flight_analysis.report.run_folder import new_run
-from flight_bringup.fly import as_file
+from flight_bringup.fly import with_file
 from flight_bringup.graph import (
     AIRCRAFT,
     CONTROLLER,
@@ -115,7 +115,7 @@ def _fly(context: LaunchContext) -> list[Action]:
     if is_simulated:
         return by_rise_di(flight, argument(context, "scenario"))
     flight.run = run = new_run(scenario, Path(argument(context, "runs")))
-    scenario = as_file(scenario, run, flight.namespace)
+    scenario = with_file(scenario, run, flight.namespace)
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
     then = tuple(spec for spec in second_stage(scenario) if spec not in others)
 

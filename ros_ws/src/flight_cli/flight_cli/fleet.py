@@ -17,7 +17,7 @@ from flight_analysis.report.run_report import (
     write_report,
 )
 from flight_analysis.report.separation import Track, place_of, separation_shortfalls
-from flight_analysis.report.summary import taken_over
+from flight_analysis.report.summary import coverage_suffix
 from flight_bringup.fleet import Fleet, MemberFlight, fly_fleet, read_fleet
 from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
 from flight_cli.words import warn
@@ -153,7 +153,7 @@ def _show(
             "-" if ticks is None else str(ticks["ticks"]),
             "-"
             if result.engaged is None
-            else f"{100.0 * result.engaged:.4g} %{taken_over(summary, 'ticks')}",
+            else f"{100.0 * result.engaged:.4g} %{coverage_suffix(summary, 'ticks')}",
             summary["outcome"]["sentence"],
         )
         lines.append(f"{each.member.name}: {display_path(each.run)}")

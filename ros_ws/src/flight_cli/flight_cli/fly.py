@@ -22,7 +22,7 @@ from flight_analysis.report.run_report import (
     write_report,
 )
 from flight_bringup.fleet import Fleet, is_fleet, new_runs
-from flight_bringup.fly import as_file, fly_in_process, fly_over_topics
+from flight_bringup.fly import fly_in_process, fly_over_topics, with_file
 from flight_bringup.graph import (
     Autopilot,
     absolute_namespace,
@@ -167,7 +167,7 @@ class Fly(RouteWords):
         learn = _learner(scenario)
         run = new_run(scenario, self.runs)
         self.context.call_on_close(partial(remove_empty, run))
-        scenario = as_file(scenario, run, namespace)
+        scenario = with_file(scenario, run, namespace)
         self._watch(run)
         by_clock = self.use_sim_time or (scenario.flight.use_sim_time and not stepping)
         is_quiet = self.as_json or self.quiet

@@ -15,7 +15,7 @@ from flight_analysis.report.export import signal_table
 from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.recorded_flight import UnflownError
 from flight_analysis.report.report import report as write_report
-from flight_analysis.report.summary import RecordedFlight, labels, taken_over
+from flight_analysis.report.summary import RecordedFlight, coverage_suffix, labels
 from flight_analysis.report.summary_rows import ERROR_COLUMNS
 from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
 from flight_cli.output import (
@@ -142,7 +142,9 @@ def _show(flights: Sequence[RecordedFlight]) -> None:
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:
     """Print the errors of several flights, with their ratios to the first flight."""
     for k, (label, flight) in enumerate(zip(labels(flights), flights, strict=True), start=1):
-        result = f"{flight.summary['outcome']['sentence']}{taken_over(flight.summary, 'errors')}"
+        result = (
+            f"{flight.summary['outcome']['sentence']}{coverage_suffix(flight.summary, 'errors')}"
+        )
         say(console, f"{k}: {label}, {result}")
     for condition in comparison.conditions(flights):
         say(console, f"{condition.key}: {'; '.join(condition.texts)}")

@@ -211,7 +211,7 @@ class GuidanceConfig(SteeringConfig):
             fence=self.fence_zones(),
             home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
             link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),
-            **self.equation_numbers(),
+            **self.guidance_constants(),
         )
 
     def notices(self) -> Notices:

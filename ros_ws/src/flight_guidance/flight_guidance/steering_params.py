@@ -44,9 +44,10 @@ FASTEST_ROLL = 0.35
 """Largest roll rate by rule, rad/s: 20 deg/s."""
 
 ALTITUDE_GAIN = 0.2
+"""Gain k_h, 1/s, for an aircraft whose flight path follows the pitch within two seconds."""
+
 ALPHA_TIME = 2.0
-"""Gain k_h, 1/s, and time constant of the angle of attack, s, for an aircraft whose flight path
-follows the pitch within two seconds."""
+"""Time constant of the angle of attack, s, for such an aircraft."""
 
 TURN_LEAD = 2.4
 """r leads the bank by this number divided by the natural frequency of r in the reference model. 1.8
@@ -64,8 +65,7 @@ w is the natural frequency of V in the reference model."""
 
 RUDDERLESS = 1.5
 """Factor on the period of path following without a rudder, because then no lead compensates the lag
-of the turn. The X8 had a limit cycle with the period of an aircraft with a rudder, but not with 1.4
-times this period."""
+of the turn. With the factor 1, the X8 had a limit cycle, and with 1.4 it had none."""
 
 STEEPEST = 0.1
 """Largest climb and sink rate by rule, as a fraction of the trim speed."""
@@ -87,8 +87,8 @@ class SteeringConfig(NodeConfig):
     )
     outputs: Names = Field(default=RATES_AND_SPEED, description="commands u_m, in any order")
     natural_frequency: Positives = Field(
-        description="natural frequencies of the reference model, rad/s; in `parameters.yaml` of a"
-        " run"
+        description="natural frequencies of the reference model, rad/s; a run has them in its"
+        " `parameters.yaml`"
     )
     speed: Positive = Field(description="trim speed V0, m/s; airspeed is speed + V")
     throttle_authority: tuple[Positive, ...] = Field(
@@ -160,9 +160,9 @@ class SteeringConfig(NodeConfig):
     )
 
     def by_rule(self) -> list[tuple[str, Any]]:
-        """Return the parameters that the file leaves out, with the values that a rule gives them.
+        """Return parameters that can come from other sections of the scenario, with values.
 
-        The rule uses other sections of the scenario.
+        Parameters without a value are left out.
         """
         return [(name, getattr(self, name)) for name in BY_RULE if getattr(self, name)]
 
@@ -210,8 +210,8 @@ class SteeringConfig(NodeConfig):
 
     def least_period(self) -> float:
         """Return the least period of path following, s."""
-        lag = 1.0 if "r" in self.outputs else RUDDERLESS
-        return lag * least_period(self.speed, self.bank, self.largest_roll_rate())
+        factor = 1.0 if "r" in self.outputs else RUDDERLESS
+        return factor * least_period(self.speed, self.bank, self.largest_roll_rate())
 
     def least_radius(self) -> float:
         """Return the least radius of fillets and orbits, m."""
@@ -229,10 +229,10 @@ class SteeringConfig(NodeConfig):
         climb, sink = reach.climb_rates(down, up, self.speed)
         return self.climb or min(climb, steepest), self.sink or min(sink, steepest)
 
-    def equation_numbers(self) -> dict[str, Any]:
-        """Return the constants that follow by rule, by field of `GuidanceParams`."""
+    def guidance_constants(self) -> dict[str, Any]:
+        """Return the constants in the equations of guidance, by field of `GuidanceParams`."""
         if self.drag is not None:
-            return self._multicopter_numbers(self.drag)
+            return self._multicopter_constants(self.drag)
         frequency = self._frequency()
         lowest, highest = self.altitudes()
         climb, sink = self.climb_limits()
@@ -285,8 +285,8 @@ class SteeringConfig(NodeConfig):
             self._frequency(), self.bank, drag, self.roll_authority or math.inf
         )
 
-    def _multicopter_numbers(self, drag: float) -> dict[str, Any]:
-        """Return a multicopter's constants that follow by rule, by field of `GuidanceParams`."""
+    def _multicopter_constants(self, drag: float) -> dict[str, Any]:
+        """Return the constants for a multicopter, by field of `GuidanceParams`."""
         gains = self._gains(drag)
         frequency = self._frequency()
         lowest, highest = self.altitudes()

@@ -27,13 +27,14 @@ from flight_log.vehicle_tables import (
     enumeration,
 )
 
-# an instance was not flown if it moves by less than this fraction of the largest motion
+# The autopilot did not fly by an instance whose signals change by less than this fraction of the
+# changes in the instance that changes most.
 STILL = 0.1
 # Two sensors agree if they differ by at most this fraction of the standard deviation of the
 # quantity.
 UNLIKE = 0.4
-# A flag is taken as set if it is set in at least this fraction of the samples. An airspeed is taken
-# as one of a flight if it is at least this fraction of the largest one.
+# A flag is taken as set if it is set in at least this fraction of the samples. A pitot tube was in
+# the airflow if its typical airspeed is at least this fraction of the fastest tube's.
 MOST = 0.5
 AIRSPEEDS = frozenset({"Airspeed", "true_airspeed_m_s"})
 TYPICAL = 90.0  # percentile that counts as the typical value of an airspeed
@@ -47,9 +48,10 @@ def instances_of_flight(
 ) -> tuple[dict[str, MessageTable], list[Taken]]:
     """Return a table for each message, and which instance was taken and why.
 
-    `fields` has the fields that are read, by message. For a message that is not in `fields`, the
-    first instance is taken. Raises ParameterError if two different instances remain, if `choice`
-    names an instance that the log lacks, or if no airspeed sensor or IMU was in use.
+    `fields` has the fields that are read, by message. For a message that is not in `fields`, and
+    for the cores of the EKF, the first instance is taken. Raises ParameterError if instances that
+    differ are left after all rules, if `choice` names an instance that the log lacks, if no IMU was
+    in use, or if no airspeed sensor was in use and the log has no estimate of the airspeed.
     """
     for name in choice.instances:
         require(
@@ -76,7 +78,7 @@ def instances_of_flight(
             if unused and _has_estimate(instances):
                 choices.append(Taken(name, (), among, Reason.ESTIMATE, unused))
                 continue
-            ways_out = "its estimate in CTUN, or --instance ARSP=0"
+            ways_out = "an estimate of the airspeed in CTUN, or --instance ARSP=0"
             reasons = "; ".join(sensor.sentence() for sensor in unused)
             require(not unused, "the log", f"no airspeed sensor in use ({reasons})", ways_out)
             tables[name], numbers, reason = _airspeed(sensors)
@@ -103,10 +105,10 @@ def instances_of_flight(
 def _of_motion(
     name: str, tables: Mapping[int, MessageTable], fields: Set[str]
 ) -> tuple[int, Reason]:
-    """Choose the instance of a message that moves, and return its number and the reason.
+    """Choose the instance whose signals change, and return its number and the reason.
 
-    If several instances move and agree, the first of them is chosen. Raises ParameterError if the
-    moving instances differ.
+    If several instances change and agree, the first of them is chosen. Raises ParameterError if the
+    changing instances differ.
     """
     motions = {number: _motion(table, fields) for number, table in tables.items()}
     moving = {
@@ -118,12 +120,13 @@ def _of_motion(
         return first, Reason.AGREES if others else Reason.MOVES
     ways_out = " or ".join(f"--instance {name}={number}" for number in moving)
     raise ParameterError(
-        f"the log: found {name} of {enumeration(sorted(moving))}, which differ, expected {ways_out}"
+        f"the log: found different instances {enumeration(sorted(moving))} of {name}, expected "
+        f"a choice: {ways_out}"
     )
 
 
 def moving_numbers(motions: Mapping[int, float], least: float = STILL) -> list[int]:
-    """Return the numbers of the instances that move at least a fraction of the largest motion."""
+    """Return the numbers of the instances with at least `least` times the largest motion."""
     return [number for number, motion in motions.items() if motion >= least * max(motions.values())]
 
 
@@ -147,7 +150,8 @@ def _deviation(values: np.ndarray) -> float:
 def _is_same_sensor(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
     """Return whether two sensors agree in each field.
 
-    The rms difference of a field may be UNLIKE times the standard deviation of the first sensor.
+    They agree if the rms difference of each field is at most UNLIKE times the standard deviation of
+    the first sensor.
     """
     for field in fields & first.fields.keys() & second.fields.keys():
         values = first.fields[field]
@@ -189,10 +193,11 @@ def _share(table: MessageTable, field: str) -> float:
 def _airspeed(
     sensors: Mapping[int, MessageTable],
 ) -> tuple[MessageTable, tuple[int, ...], Reason]:
-    """Return the airspeed of the primary sensor, or of another sensor in use and healthy.
+    """Return the airspeed of the primary sensor, or of another healthy sensor.
 
-    The primary sensor may change in flight. The airspeed is NaN while the sensor is not healthy.
-    The further results are the numbers of the sensors that were taken, and why.
+    Another sensor is taken if the primary one was mostly not healthy, or if a sensor in use differs
+    from it. The primary sensor may change in flight. The airspeed is NaN while the sensor is not
+    healthy. The further results are the numbers of the sensors that were taken, and why.
     """
     tables = {number: _healthy(table) for number, table in sensors.items()}
     live = {
@@ -222,10 +227,10 @@ def _airspeed(
 def _unused_sensors(
     sensors: Mapping[int, MessageTable], parameters: Parameters
 ) -> tuple[UnusedSensor, ...]:
-    """Return the airspeed sensors if the autopilot flew by none of them.
+    """Return all airspeed sensors if the autopilot used none of them.
 
-    The log shows this by the flags U and H, or if it has no U, by the parameter ARSPD_USE. The
-    result is empty if the autopilot flew by a sensor, or if the log does not show it.
+    A sensor was used if the flags U and H say so. In a log without U, the parameter ARSPD_USE
+    replaces it. If a sensor was used, or if the log does not tell, the result is empty.
     """
     unused = []
     for number, table in sorted(sensors.items()):
@@ -257,7 +262,7 @@ def _healthy(table: MessageTable) -> MessageTable:
 def _primary(tables: Mapping[int, MessageTable]) -> tuple[list[int], MessageTable] | None:
     """Return the numbers of all sensors that were primary, and the samples of the primary one.
 
-    Returns None for a log without `Pri`.
+    Returns None if the log has no `Pri`, or if `Pri` names none of the sensors.
     """
     if not all("Pri" in table.fields for table in tables.values()):
         return None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Read and make metadata.yaml of a bag, version 9 of rosbag2, and find the files of a bag.
+"""Read and make metadata.yaml of a bag, in version 9 of its format, and find a bag's files.
 
 The module needs no ROS.
 """
@@ -46,9 +46,11 @@ class FileContents(NamedTuple):
         return sum(count.messages for count in self.counts)
 
 
-SUFFIXES = (".mcap", ".db3")
-PACKED_SUFFIXES = (".zstd", ".zst", ".lz4")
-"""Suffixes of the files of a bag, and the suffixes that packed files add."""
+SUFFIXES = (".mcap", ".db3")  # of the files of a bag
+PACKED_SUFFIXES = (".zstd", ".zst", ".lz4")  # that a packed file has in addition
+
+
+EXPECTED = "the metadata.yaml that rosbag2 writes"
 
 
 def plain_name(name: str) -> str:
@@ -86,12 +88,12 @@ def bag_files(run: Path) -> list[Path]:
             by_name.setdefault(name, file)
     files = list(by_name.values())
     kinds = {re.sub(r"(_\d+)?(?=\.\w+$)", "", name) for name in by_name}
-    require(len(kinds) < 2, str(run), _several(files), "one bag in the folder of a run")
+    require(len(kinds) < 2, str(run), _files_found(files), "one bag in the folder of a run")
     return sorted(files, key=lambda file: _order(file.name))
 
 
-def _several(files: Sequence[Path]) -> str:
-    """Return the part of a sentence that describes files of several bags."""
+def _files_found(files: Sequence[Path]) -> str:
+    """Describe files of several bags, for an error."""
     present = {*chain.from_iterable(file.suffixes for file in files)}
     suffixes = " and ".join(suffix for suffix in SUFFIXES if suffix in present)
     return f"{len(files)} {suffixes} files that are not parts of one bag"
@@ -102,7 +104,7 @@ def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
 
     Raises ParameterError if the file is missing, or if it was not made by rosbag2.
     """
-    tree = read_yaml(run / METADATA, METADATA, "that of rosbag2")
+    tree = read_yaml(run / METADATA, METADATA, EXPECTED)
     try:
         information: dict[str, Any] = dict(tree[INFORMATION])
         start = information["starting_time"]["nanoseconds_since_epoch"]
@@ -110,9 +112,9 @@ def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
         end_ns = int(start) + int(duration)
     except (KeyError, OverflowError, TypeError, ValueError):
         raise ParameterError(
-            f"{METADATA}: found something else, expected that of rosbag2"
+            f"{METADATA}: found no description of a bag, expected {EXPECTED}"
         ) from None
-    require(abs(end_ns) < 2**63, METADATA, "an end time beyond 64 bits", "that of rosbag2")
+    require(abs(end_ns) < 2**63, METADATA, "an end time beyond 64 bits", EXPECTED)
     return information, end_ns
 
 
@@ -121,11 +123,11 @@ def bag_metadata_yaml(
     previous: Mapping[str, Any] | None = None,
     missing: Sequence[str] = (),
 ) -> str:
-    """Write the text of metadata.yaml.
+    """Return the text of a metadata.yaml.
 
-    Compression, custom data and distribution come from `previous`, the content of an earlier
-    metadata.yaml. Files that it lists but that are `missing` from the folder stay in the lists of
-    files.
+    Compression, custom data and distribution come from `previous`, which `read_bag_metadata`
+    returned for an earlier metadata.yaml. Files that it lists but that are `missing` from the
+    folder stay in the lists of files.
     """
     counts: dict[str, TopicCount] = {}
     for count in chain.from_iterable(file.counts for file in files):

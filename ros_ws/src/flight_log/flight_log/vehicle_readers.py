@@ -61,8 +61,8 @@ from flight_log.vehicle_tables import (
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID of a ground station and of other components
 ULOG_HEAD = 16  # bytes of magic, version and time at the beginning of a ULog
-# Reads that pyulog may make for each byte of a log. It searches damaged data byte by byte. For each
-# byte it reads, twice, the head of a message and the message that may follow.
+# Reads that pyulog may make for each byte of a log. In damaged data it starts a search at each
+# byte. The head of a message and the message after it are then read twice.
 READS_PER_BYTE = 4
 FIRMWARE = re.compile(r"(?:Ardu|APM:)(Plane|Copter|Rover|Sub)")  # in a MSG of ArduPilot
 FIRMWARES: Mapping[str, VehicleKind] = MappingProxyType(
@@ -130,12 +130,12 @@ def _read_dataflash(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
                 not is_old,
                 str(path),
                 "a log of PX4 before 2017 (sdlog2)",
-                "a ULog: that of PX4 since then",
+                "a ULog, which PX4 has written since then",
             )
 
     instances, parameters, parts = tables_of(samples(), fields_and_flags)
     tables, choices = instances_of_flight(instances, fields, parameters, choice)
-    _true_airspeed(tables)
+    _convert_to_true_airspeed(tables)
     vehicle = FIRMWARES.get(next(iter(firmwares), ""))
     if (attitude := tables.get("ATT")) is not None:
         attitude.fields["Yaw"][:] = np.remainder(attitude.fields["Yaw"] + 180.0, 360.0) - 180.0
@@ -150,7 +150,7 @@ def _read_dataflash(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     )
 
 
-def _true_airspeed(tables: Mapping[str, MessageTable]) -> None:
+def _convert_to_true_airspeed(tables: Mapping[str, MessageTable]) -> None:
     """Convert equivalent airspeed to true airspeed in place, by the ratio in CTUN."""
     control = tables.get("CTUN")
     if control is None or "E2T" not in control.fields:
@@ -180,7 +180,7 @@ def _read_tlog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     autopilots: dict[int, tuple[int, int]] = {}
     messages: dict[int, list[Received]] = {}
     mavutil.set_dialect("ardupilotmega")
-    # mavlogfile tells the kind by the content, not by the name.
+    # mavlogfile would not skip bytes before the first message.
     with path.open("rb") as stream:
         start = tlog_start(stream.read(HEAD_BYTES)) or 0
     with closing(mavutil.mavlogfile(str(path))) as reader:
@@ -222,8 +222,8 @@ def _flown_system(
 ) -> tuple[int, tuple[Taken, ...]]:
     """Choose which system of a tlog flew, and return its number.
 
-    `choice` is the user's choice. The number is 0 if no autopilot sent a heartbeat. If the user
-    chose, or if there were several systems, also returns what was taken and why. Raises
+    `choice` is the user's choice. The number is 0 if no autopilot sent a heartbeat. The second
+    result says what was taken and why. It is empty if there was nothing to choose. Raises
     ParameterError if two systems moved, or if the log lacks the system that the user chose.
     """
     among = tuple(messages_of)
@@ -244,15 +244,16 @@ def _flown_system(
     if len(moving) > 1:
         ways_out = " or ".join(f"--system {system}" for system in moving)
         raise ParameterError(
-            f"the log: found motion of the systems {enumeration(moving)}, expected {ways_out}"
+            f"the log: found several systems that moved, {enumeration(moving)}, expected a choice: "
+            f"{ways_out}"
         )
     if len(among) == 1:
         return moving[0], ()
     return moving[0], (Taken("system", (moving[0],), among, Reason.SYSTEM_MOVES),)
 
 
-# Least share of different times among the messages with a time. With a smaller share, the clock
-# stands still.
+# The clock is taken to stand still if at most this share of the messages with a time have different
+# times.
 LEAST_TIMES = 0.1
 # number of recent messages with a time, from which a message without a time gets its time
 RECENT = 16
@@ -276,7 +277,7 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
     else:
         offset_ns = with_time[0].arrival_ns - 1_000_000 * with_time[0].content.time_boot_ms
     newest_ns = with_time[0].arrival_ns if with_time else 0
-    # Sequences and stamps; the stamp is None for a message that has come before.
+    # Sequences and stamps. The stamp of a repetition is None.
     recent = deque[tuple[int, int | None]](maxlen=RECENT)
     arrivals: dict[tuple[str, int], int] = {}  # ns, by name and time, without repetitions
     for message in messages:
@@ -293,12 +294,12 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
             newest_ns = newest_ns if stamp_ns is None else stamp_ns
             recent.appendleft((message.sequence, stamp_ns))
         else:
-            link = min(
+            preceding = min(
                 recent,
                 key=lambda place: (message.sequence - place[0]) % 256,
                 default=(0, newest_ns),
             )
-            stamp_ns = link[1]
+            stamp_ns = preceding[1]
         if name == "PARAM_VALUE":
             yield (
                 SETTING,
@@ -315,7 +316,7 @@ def _read_ulog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     from pyulog.core import ULogException  # noqa: PLC0415
 
     if path.stat().st_size < ULOG_HEAD:
-        raise ValueError("its head is cut")
+        raise ValueError("the head of the file is cut short")
     messages = whole_messages(path.read_bytes())
     loss = messages.loss
     try:
@@ -323,7 +324,7 @@ def _read_ulog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
         log = ULog(UlogContent(messages.content))
     except (ULogException, EOFError) as error:
         raise ValueError(error) from None
-    damage = ", damaged: what can be read" if log.file_corruption else ""
+    damage = ", damaged: only a part can be read" if log.file_corruption else ""
     if log.dropouts:
         loss = _with_dropouts(loss, log.dropouts)
     instances: Instances = {}
@@ -411,7 +412,8 @@ def _angles(attitude: MessageTable) -> dict[str, FloatArray]:
 def _vehicle(instances: Instances) -> tuple[VehicleKind | OtherVehicle | None, bool]:
     """Return the kind of vehicle in `vehicle_status`, if known, and whether it is a VTOL.
 
-    In a log before PX4 1.10, this adds the field `vehicle_type` to the table.
+    The kind of a VTOL is None, because it changes in flight. In a log before PX4 1.10, this adds
+    the field `vehicle_type` to the table.
     """
     table = instances.get("vehicle_status", {}).get(0)
     if table is None:
@@ -430,7 +432,7 @@ def _vehicle(instances: Instances) -> tuple[VehicleKind | OtherVehicle | None, b
     number = int(np.median(fields.get("vehicle_type", np.zeros(1))))
     if number == 0:
         return None, False
-    kinds = {of_kind: kind for kind, of_kind in VEHICLE_TYPES.items()}
+    kinds = {code: kind for kind, code in VEHICLE_TYPES.items()}
     return kinds.get(number) or OtherVehicle("vehicle_type", number), False
 
 

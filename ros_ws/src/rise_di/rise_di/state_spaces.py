@@ -20,7 +20,7 @@ class LinearSystems(NamedTuple):
 
     Attributes:
         plant: The nominal aircraft from `u_NAME` to `y_NAME`, SI. It has the lags and the delay
-            that the controller was told. It is the exact discretisation for a u that is held from
+            in the controller's parameters. It is the exact discretisation for a u that is held from
             tick to tick.
         law: The law near e = 0 at y_m = 0, from `y_NAME` to `u_NAME`.
         loop: The closed loop. Its inputs are `d_NAME`, a disturbance that is added to u, and
@@ -36,8 +36,8 @@ class LinearSystems(NamedTuple):
 def linear_systems(scenario: Scenario) -> LinearSystems:
     """Return plant, law and closed loop of a scenario as linear systems of python-control.
 
-    `margins` and `rise-di gains check` compute the margins of this loop. The loop holds at y_m = 0
-    and inside all limits. With an allocation, `u_NAME` are the channels of the law.
+    `margins` and `rise-di gains check` compute the margins of this loop. The systems are valid near
+    y_m = 0 and while no limit acts. With an allocation, `u_NAME` are the channels of the law.
 
     Args:
         scenario: The aircraft and the controller.
@@ -46,7 +46,7 @@ def linear_systems(scenario: Scenario) -> LinearSystems:
         The three systems.
 
     Raises:
-        ParameterError: python-control is missing, or as in `margins`.
+        ParameterError: python-control is missing, or `margins` would raise this error.
 
     Examples:
         >>> systems = rise_di.linear_systems(rise_di.find_scenario("osprey_servo"))
@@ -68,15 +68,17 @@ def linear_systems(scenario: Scenario) -> LinearSystems:
     n = [f"n_{name}" for name in measured]
     d = [f"d_{name}" for name in linear.inputs]
     dt = linear.loop.period
-    none = np.zeros((len(y), len(u)))
+    no_feedthrough = np.zeros((len(y), len(u)))
     closed = (
         np.block([[A + B @ law.D @ C, B @ law.C], [law.B @ C, law.A]]),
         np.block([[B, B @ law.D], [np.zeros((len(law.A), len(d))), law.B]]),
         np.block([[C, np.zeros((len(y), len(law.A)))], [law.D @ C, law.C]]),
-        np.block([[none, np.zeros((len(y), len(n)))], [np.zeros((len(u), len(d))), law.D]]),
+        np.block(
+            [[no_feedthrough, np.zeros((len(y), len(n)))], [np.zeros((len(u), len(d))), law.D]]
+        ),
     )
     return LinearSystems(
-        plant=control.ss(A, B, C, none, dt, inputs=u, outputs=y, name="aircraft"),
+        plant=control.ss(A, B, C, no_feedthrough, dt, inputs=u, outputs=y, name="aircraft"),
         law=control.ss(*law, dt, inputs=y, outputs=u, name=controller.law),
         loop=control.ss(*closed, dt, inputs=[*d, *n], outputs=[*y, *u], name="loop"),
     )

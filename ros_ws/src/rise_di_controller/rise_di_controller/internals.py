@@ -61,9 +61,9 @@ def groups(
     e_0 (e at engagement), integral_e (units of y times s) and Pi (scaled input). Each input has u
     before (u_free) and after saturation (u), u_trim, limited (Saturation) and u_ff (feedforward).
     An observer adds its estimates z, u_o for each input, and sigma, the fade-in. Vanes add the mean
-    of their readings, the mean square around the mean, 1 for a vane in use, the reading, and the
-    reading in the reference motion. An allocation adds the group effector with the commands
-    of the effectors.
+    of their readings, the mean square around the mean, `vane_measures` (1 while a vane is in use),
+    `vane` (its reading), and `vane_m` (what it would read in the reference motion). An allocation
+    adds the group effector with the commands of the effectors.
     """
     state_groups = [
         name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)
@@ -80,10 +80,10 @@ def groups(
 def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """List the channel names of `internals`, first the scalars and then "group.name".
 
-    The scalars are mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (time of the tick
-    after its deadline, s), age (age of y at the tick, s), number and parameters
-    (ControllerConfig.digest). number counts the samples from 1 since the start, so a gap shows a
-    lost sample.
+    The scalars are mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (by how much
+    the tick came after its deadline, s), age (age of y at the tick, s), number and parameters
+    (ControllerConfig.digest). The channel `number` counts the samples from 1 since the start, so a
+    gap shows a lost sample.
     """
     channels = list(SCALARS)
     for group, members in grouped.items():
@@ -103,9 +103,10 @@ def values(
 ) -> FloatArray:
     """Return the values of the topic `internals`, in the order of `names`.
 
-    `given_up` is 1 for each output that no longer uses its learned model, (m,), and is empty
-    without a learner. With an allocation, an input is shown as limited by MAGNITUDE if the input or
-    any effector is at a stop. Raises ValueError if the law was never engaged.
+    `given_up` is 1 for each output that gets no learned model, (m,), and is empty without a
+    learner. An input that saturates is shown as limited by MAGNITUDE if u_free is outside of its
+    limits, or if any effector of an allocation is at a stop. Raises ValueError if the law was never
+    engaged.
     """
     if state.law is None:
         raise ValueError(

@@ -37,8 +37,8 @@ from rise_di_controller.law.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerConfig
 
-# Time, s, of past ticks over which a new observer runs before it flies, so that its estimates of
-# the disturbances replace what the law has integrated.
+# Length, s, of the recorded ticks on which a new observer is run before it is used. Then its
+# estimates of the disturbances replace what the law has integrated.
 HISTORY = 5.0
 
 
@@ -62,13 +62,16 @@ class ScheduleConfig(Config):
     """The schedule of input_scale over dynamic pressure, an extension of the paper."""
 
     speed: Positive = Field(description="trim speed V0, at which input_scale holds, m/s")
-    time: Positive = Field(default=1.0, description="time constant at which input_scale follows, s")
+    time: Positive = Field(
+        default=1.0, description="time constant of the filter of dynamic pressure, s"
+    )
     slow: SpeedConfig | None = Field(
         default=None,
-        description="models below the trim speed, with an observer; between, they are interpolated",
+        description="models at a speed below the trim speed, if there is an observer; between the "
+        "speeds they are interpolated",
     )
     fast: SpeedConfig | None = Field(
-        default=None, description="models above the trim speed, with an observer"
+        default=None, description="models at a speed above the trim speed, if there is an observer"
     )
 
     @property
@@ -82,21 +85,25 @@ class PriorConfig(Config):
 
     file: str | None = Field(
         default=None,
-        description="airframe file of the model, as of `rise-di learn`; none: that of the aircraft",
+        description="airframe file of the model, such as `rise-di learn` writes; none: the file of "
+        "the aircraft",
     )
     off: Annotated[float, Field(ge=0.05, le=1.0)] | None = Field(
         default=None,
-        description="standard deviation of the entries, relative, or of their logarithms if it is "
-        "above 0.29; none: 0.29, for +-50 %",
+        description="relative standard deviation of the entries; a value above 0.29 is the "
+        "standard deviation of their logarithms; none: 0.29, which is the one of a uniform "
+        "distribution within +-50 %",
     )
     sketch: bool = Field(
         default=False,
-        description="whether the rough model is the feedforward, a sketch made by rule, as for an "
-        "aircraft of JSBSim, instead of the airframe file",
+        description="whether the rough model is the one in the feedforward and not the airframe "
+        "file; for an aircraft of JSBSim, a rule makes this model",
     )
 
 
-LEAST_MARGIN = 0.02  # delay margin that a learned model must keep, s: two periods at 100 Hz
+# largest delay margin, s, that is required of a learned model if `learn.margin` is not set: two
+# periods at 100 Hz
+DEFAULT_MARGIN = 0.02
 
 
 class LearnConfig(Config):
@@ -118,8 +125,8 @@ class LearnConfig(Config):
     prior: PriorConfig | None = Field(default=None, description="the rough model")
     margin: Annotated[float, Field(ge=0, le=0.5)] | None = Field(
         default=None,
-        description="least delay margin of a learned model, s; none: as the loop of the file has "
-        "around the model",
+        description="least delay margin of a learned model, s; none: the margin of the loop at the "
+        "start, but at most 0.02 s",
     )
     without: tuple[str, ...] | None = Field(
         default=None,
@@ -131,14 +138,14 @@ class LearnConfig(Config):
     )
 
     def least_margin(self, margin: float) -> float:
-        """Return the delay margin that a learned model must keep, s.
+        """Return the delay margin that a learned model must have, s.
 
-        If `learn.margin` is set, it is this margin. Otherwise it is the smaller of LEAST_MARGIN and
-        `margin`, the delay margin of the loop at the start. The loop at the start has this margin
-        around the model in the scenario, but perhaps not around the real aircraft, so no learned
-        model need have more.
+        This is `learn.margin` if it is set. Otherwise it is the smaller of DEFAULT_MARGIN and
+        `margin`, the delay margin of the loop at the start. More is not required, because the loop
+        at the start has `margin` only around the model in the scenario, and perhaps not around the
+        real aircraft.
         """
-        return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
+        return min(margin, DEFAULT_MARGIN) if self.margin is None else self.margin
 
     def spacing(self) -> float:
         """Return the shortest time between two of `updates`, s; `window` if there is only one."""
@@ -148,7 +155,7 @@ class LearnConfig(Config):
 
 
 class RiseDiConfig(ControllerConfig):
-    """The controller under RISE dynamic inversion, the paper's law.
+    """The parameters of a controller that flies by RISE dynamic inversion, the paper's law.
 
     Args:
         values: Values by name of the parameter.
@@ -223,16 +230,18 @@ class RiseDiConfig(ControllerConfig):
 
     @classmethod
     def changed_by_node(cls) -> frozenset[str]:
-        """Return the parameters with a model, which only proposals of a learner may change.
+        """Return the names of the parameters that hold a model.
 
-        A change by an operator would bypass the certification.
+        In flight only proposals of a learner may change them. A change by an operator would bypass
+        the certification.
         """
         return frozenset({"feedforward", "observer"})
 
     def check_law(self) -> None:
-        """Check that each key has a value for each channel, but k_d one for all except the last.
+        """Check that each key has one value for each channel.
 
-        A schedule needs the output V, and a learner needs an observer without vanes.
+        k_d has no value for the last channel. A schedule needs the output V, and a learner needs an
+        observer without vanes.
         """
         require_length("k_d", self.k_d, self.outputs[:-1])
         for key in ("Lambda", "beta", "omega"):
@@ -246,7 +255,7 @@ class RiseDiConfig(ControllerConfig):
                 self.observer is not None,
                 "learn",
                 "no observer",
-                "one, with part 0 if it does not fly yet",
+                "an observer, whose `part` is 0 if its estimates are not used yet",
             )
             require(
                 not self.vanes,
@@ -280,7 +289,7 @@ class RiseDiConfig(ControllerConfig):
             followed,
             "schedule",
             f"the outputs {', '.join(self.outputs)}",
-            "V among them, and one that follows V",
+            "V and at least one other output",
         )
         if self.feedforward is None and self.observer is None:
             require(
@@ -361,7 +370,7 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def _at_speed(self, ratio: float, feedforward: OverSpeed, observer: OverSpeed) -> Self:
-        airspeed = self._airspeed()
+        airspeed = self._is_airspeed()
         scale = airspeed + (1.0 - airspeed) / ratio**2
         sections: dict[str, Any] = {}
         for key, matrices, names in (
@@ -388,7 +397,8 @@ class RiseDiConfig(ControllerConfig):
             )
         return self.model_copy(update=sections)
 
-    def _airspeed(self) -> FloatArray:
+    def _is_airspeed(self) -> FloatArray:
+        """Return 1 for the output V, and 0 for each other output, (m,)."""
         return np.array([float(name == "V") for name in self.outputs])
 
     def _over_speed(
@@ -398,11 +408,15 @@ class RiseDiConfig(ControllerConfig):
     ) -> OverSpeed:
         """Interpolate a model from its matrices at the trim speed and the scheduled speeds."""
         assert self.schedule is not None  # noqa: S101 - for the type checker
-        airspeed, (slow, fast) = self._airspeed(), self.schedule.models
+        is_airspeed, (slow, fast) = self._is_airspeed(), self.schedule.models
         at_trim = matrices(self.model_copy(update={"schedule": None}), np.ones(len(self.outputs)))
-        at_slow = matrices(self._with_models(slow), airspeed + (1.0 - airspeed) / slow.ratio**2)
-        at_fast = matrices(self._with_models(fast), airspeed + (1.0 - airspeed) / fast.ratio**2)
-        return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), airspeed, model)
+        at_slow = matrices(
+            self._with_models(slow), is_airspeed + (1.0 - is_airspeed) / slow.ratio**2
+        )
+        at_fast = matrices(
+            self._with_models(fast), is_airspeed + (1.0 - is_airspeed) / fast.ratio**2
+        )
+        return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), is_airspeed, model)
 
     def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:
         """Return the nominal model of the feedforward as a function of the airspeed.
@@ -416,7 +430,7 @@ class RiseDiConfig(ControllerConfig):
         return self._over_speed(matrices, partial(nominal_of, at_trim))
 
     def models(self) -> tuple[Any, ...]:
-        """Return the models of the base class, and the models at other speeds."""
+        """Return the models of the base class and, as one more element, those at other speeds."""
         return (*super().models(), () if self.schedule is None else self.schedule.models)
 
     def guard(self) -> GuardParams:
@@ -451,7 +465,7 @@ class RiseDiConfig(ControllerConfig):
         return TunedLaw(
             with_schedule(law.control_law),
             ScheduleParams(
-                law=law.params, speed=speed, airspeed=self._airspeed(), time=time, observer=over
+                law=law.params, speed=speed, airspeed=self._is_airspeed(), time=time, observer=over
             ),
         )
 
@@ -509,7 +523,7 @@ class RiseDiConfig(ControllerConfig):
         scaling = "" if self.schedule is None else "; input_scale follows the dynamic pressure"
         if self.sign != "auto":
             return f"{self.sign} sign, as configured{scaling}"
-        late = f"because lag and delay of {self._latest():g} s"
+        late = f"because lag and delay of {self._largest_lateness():g} s"
         half = f"half a period ({0.5 / self.rate:g} s)"
         if self.sampled_sign() is Sign.IMPLICIT:
             return f"implicit sign, {late} are below {half}{scaling}"
@@ -523,8 +537,8 @@ class RiseDiConfig(ControllerConfig):
         """
         if self.sign != "auto":
             return Sign[self.sign.upper()]
-        return Sign.IMPLICIT if self._latest() < 0.5 / self.rate else Sign.SOFT
+        return Sign.IMPLICIT if self._largest_lateness() < 0.5 / self.rate else Sign.SOFT
 
-    def _latest(self) -> float:
+    def _largest_lateness(self) -> float:
         """Return the largest lag plus the delay, s."""
         return max(self.lag) + self.delay

@@ -20,7 +20,7 @@ from flight_core.vectors import FloatArray
 
 
 class Kind(Enum):
-    """The kind of a quantity that a state is, on which the exponents of its entries depend."""
+    """The physical kind of a state. The exponents of its row and of its column depend on it."""
 
     SPEED = auto()
     INCIDENCE = auto()  # alpha or beta
@@ -45,11 +45,12 @@ EXPONENTS: Mapping[Kind, Mapping[Kind, float]] = {
 }
 """Exponents of the ratio of airspeeds in an entry of A, by the kinds of its row and column.
 
-In level flight lift equals weight at any speed: alpha_dot = q - L / (m V) + g / V, where L grows
-with V^2 about the trim. A[alpha,V] is therefore -2 g / V^2.
+In level flight alpha_dot = q - L / (m V) + g / V. In each trim the lift L equals the weight, and
+around this trim it grows with V^2. A[alpha,V] is therefore -2 g / V^2.
 """
 
-# Exponents for the columns of B, by the kind of the row: of a surface, and of the thrust.
+# Exponents in the column of B that belongs to a surface, and in the one that belongs to the thrust,
+# by the kind of the row.
 OF_SURFACE = {Kind.SPEED: 2.0, Kind.INCIDENCE: 1.0, Kind.RATE: 2.0, Kind.ANGLE: 0.0}
 OF_THRUST = {Kind.SPEED: 0.0, Kind.INCIDENCE: -1.0, Kind.RATE: 0.0, Kind.ANGLE: 0.0}
 
@@ -59,7 +60,7 @@ WIND_STATE = {
     "vertical": Kind.INCIDENCE,
     **dict.fromkeys(ROTARY, Kind.RATE),
 }
-"""Kind of the state in which wind along an axis acts relative to the air."""
+"""Kind of the state, relative to the air, that wind along an axis changes."""
 
 TRIM_STEPS = 20  # steps of the airspeed: the trim at 1.4 V0 is then exact to 1e-4 of its value
 # V / V0 at which a simulated aircraft has trims; between them the trim is interpolated linearly
@@ -106,7 +107,7 @@ def exponents(airframe: Airframe, thrust: str) -> Exponents:
 
 
 def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
-    """Return an airframe at `ratio` times its trim speed V0, with the same shape and units.
+    """Return an airframe at `ratio` times its trim speed V0, with the same states and units.
 
     Moments caused by an angle of incidence or by a surface grow with V^2, and dampings with V. The
     effect of a force on an angle of incidence grows with the force over V. Thrust, gravity and
@@ -138,8 +139,8 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
 
     In level flight dx consists of the step dV and of dalpha = dtheta, and the other states keep
     their values. The airspeed changes in TRIM_STEPS steps. Each step takes A, gravity and B at its
-    middle airspeed. If several inputs can keep the trim, du is the smallest solution. Raises as
-    `exponents` does.
+    middle airspeed. If several inputs can keep the trim, each step takes the smallest (dalpha, du).
+    Raises as `exponents` does.
     """
     names = list(airframe.states)
     powers = exponents(airframe, thrust)
@@ -147,18 +148,18 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
     A = airframe.matrix_a()
     gravity = airframe.matrix_gravity()
     B = airframe.matrix_b()
-    faster = np.array([float(name == "V") for name in names])
-    higher = np.array([float(name in ("alpha", "theta")) for name in names])
+    along_v = np.array([float(name == "V") for name in names])
+    along_pitch = np.array([float(name in ("alpha", "theta")) for name in names])
     x = np.zeros(len(names))
     u = np.zeros(B.shape[1])
     for k in range(TRIM_STEPS):
         middle = 1.0 + width * (k + 0.5)
         matrix = A * middle**powers.A + gravity * middle**powers.gravity
-        dx = airframe.speed * width * faster
+        dx = airframe.speed * width * along_v
         change = np.linalg.lstsq(
-            np.column_stack([matrix @ higher, B * middle**powers.B]), -matrix @ dx, rcond=None
+            np.column_stack([matrix @ along_pitch, B * middle**powers.B]), -matrix @ dx, rcond=None
         )[0]
-        x = x + dx + change[0] * higher
+        x = x + dx + change[0] * along_pitch
         u = u + change[1:]
     return x, u
 
@@ -166,13 +167,14 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
 def over_airspeed(airframe: Airframe, thrust: str) -> OverAirspeed:
     """Return how A, B and the trim of an airframe follow the airspeed: exponents and trims.
 
-    Raises ParameterError as `exponents` does, and for an airframe without V or without a speed.
+    Raises ParameterError as `exponents` does, for an airframe without a state V or a trim speed,
+    and for a `thrust` that is no input.
     """
     require(
         "V" in airframe.states and airframe.speed > 0.0,
         "over_airspeed",
-        f"{airframe.name} without V or speed",
-        "both",
+        f"{airframe.name} without a state V or a trim speed",
+        "an airframe with both",
     )
     require(
         thrust in airframe.inputs,

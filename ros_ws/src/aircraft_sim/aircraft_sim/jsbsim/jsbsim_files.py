@@ -82,7 +82,8 @@ class ModelFiles(NamedTuple):
     def archive(self) -> bytes:
         """Return a zip file of the root; the same files always give the same bytes.
 
-        Unpacked to FOLDER, the airframe jsbsim:FOLDER/aircraft/NAME flies in the same way.
+        If it is unpacked to FOLDER, the airframe jsbsim:FOLDER/aircraft/NAME flies as the original
+        model.
         """
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -101,9 +102,9 @@ class _Place(NamedTuple):
 def model_files(model: Path) -> ModelFiles:
     """Collect the files of a model that does not come from the package jsbsim.
 
-    Raises ParameterError if a file is missing or cut short, or if it lies outside of the folders of
-    the model and its root, even if only a link leads there. It is also raised if the model has a
-    child model, or a property that writes a file.
+    Raises ParameterError if a file is missing or cut short, or lies outside of the model's folder
+    and of the model's root, also by way of a link, and if the model has a child model or a property
+    that writes a file.
     """
     first = _Place(f"aircraft/{model.stem}/{model.name}", model)
     members: dict[str, bytes] = {}
@@ -130,7 +131,7 @@ def model_files(model: Path) -> ModelFiles:
                 waiting += [] if source is None else [source]
                 missing |= {name: element.tag} if source is None else {}
     if missing:
-        raise ParameterError(_sentence(model, missing))
+        raise _missing_files(model, missing)
     return ModelFiles(first.member, dict(sorted(members.items())), left_out)
 
 
@@ -172,11 +173,11 @@ def _relative(name: str, path: Path) -> str:
     return str(plain).removesuffix(SUFFIX) + SUFFIX
 
 
-def _sentence(model: Path, missing: Mapping[str, str]) -> str:
-    """Write a sentence about missing files of a model.
+def _missing_files(model: Path, missing: Mapping[str, str]) -> ParameterError:
+    """Return the error for missing files of a model.
 
     `missing` has the names of the files, each with the element of the model that names it. The
-    sentence is about the first file, and about the other files with the same kind of element.
+    error is about the first file, and about the others that are searched in the same folders.
     """
     element = next(iter(missing.values()))
     names = sorted(
@@ -189,7 +190,8 @@ def _sentence(model: Path, missing: Mapping[str, str]) -> str:
     folders = [str(model.parent / FOLDERS.get(element, ("",))[0])]
     if (root_folder := ROOT_FOLDERS.get(element)) is not None:
         folders.append(str(root_of(model) / root_folder))
-    return f"no {SUFFIX} of {', '.join(names)} is in {' or '.join(folders)}"
+    files = ", ".join(name + SUFFIX for name in names)
+    return ParameterError(f"{model}: found no file {files}, expected it in {' or '.join(folders)}")
 
 
 def _content(path: Path) -> bytes:
@@ -209,7 +211,7 @@ def _content(path: Path) -> bytes:
 def _parsed(content: bytes, path: Path) -> ElementTree.Element:
     """Parse XML as JSBSim reads it, which means that names have no namespaces.
 
-    Raises ParameterError.
+    Raises ParameterError if the text is not well formed.
     """
     builder = ElementTree.TreeBuilder()
     parser = expat.ParserCreate()
@@ -247,7 +249,7 @@ def _start_tag(element: ElementTree.Element) -> str:
 
 
 def _require_no_writer(tree: ElementTree.Element, path: Path) -> None:
-    """Check that a file sets no property by which JSBSim writes a file.
+    """Check that a file does not contain the name of a property by which JSBSim writes a file.
 
     Raises ParameterError if it does.
     """

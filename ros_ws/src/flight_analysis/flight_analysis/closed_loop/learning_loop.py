@@ -14,7 +14,7 @@ from flight_analysis.closed_loop.stations import ControllerStation, Topics
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.controller import Controller
-from rise_di_controller.learning.learned_channels import authority_names, outputs_without
+from rise_di_controller.learning.learned_channels import authority_names, outputs_given_up
 from rise_di_controller.learning.proposals import (
     AUTHORITY_TICKS,
     Learning,
@@ -192,7 +192,7 @@ def proposed(
     learner: Learner, learning: Learning, controller: Controller, t_ns: int
 ) -> LearnerResult:
     """Ask the learner for a proposal at a tick, pass it to the controller, and return it."""
-    proposal = learner.propose(controller.digest, outputs_without(controller.parameters))
+    proposal = learner.propose(controller.digest, outputs_given_up(controller.parameters))
     received = as_received(proposal, learning.start, t_ns, controller.digest)
     learning.receive(received, controller, t_ns)
     return proposal

@@ -13,7 +13,7 @@ from flight_analysis.report.glossary import words_in
 from flight_analysis.report.overlay import difference_table
 from flight_analysis.report.page import Colour, Figures, Page, Section, TableGroup, Verdict
 from flight_analysis.report.plotting import PlotContext
-from flight_analysis.report.summary import RecordedFlight, taken_over
+from flight_analysis.report.summary import RecordedFlight, coverage_suffix
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -27,8 +27,9 @@ from flight_analysis.report.tables import TIMES, MetricTable
 def comparison_page(flights: Sequence[RecordedFlight], tolerances: Mapping[str, float]) -> Page:
     """Return the page of several flights, each with its own colour and compared with the first one.
 
-    If one of the flights is an imported log, without a scenario, the page only draws signals of the
-    same name over each other. `tolerances` has the allowed difference of each channel, SI.
+    If a flight has no scenario, as an imported log, the page has no metrics. It overlays signals of
+    the same name, and states their differences. `tolerances` has the allowed difference of each
+    channel, SI.
     """
     context = figures.plot_context(flights)
     colours = {label: run.colour for label, run in context.runs.items()}
@@ -52,7 +53,7 @@ def comparison_page(flights: Sequence[RecordedFlight], tolerances: Mapping[str, 
             Section(
                 "Output y over the reference y_m",
                 "",
-                figures.tracking_figure(context, _common_trim(scenarios)),
+                figures.tracking_figure(context, _label_of_v(scenarios)),
                 contents="Outputs",
             ),
             *_tracks(flights, colours),
@@ -82,12 +83,12 @@ def _verdict(flight: RecordedFlight, label: str, colour: str) -> Verdict:
         return Verdict(headline=headline, colour=Colour.PLAIN, label=label, line=colour)
     verdict = verdict_of(flight, flight.scenario)
     described, _ = meta_lines(flight, flight.scenario)
-    error = f"{flight.summary['error']}{taken_over(flight.summary, 'errors')}"
+    error = f"{flight.summary['error']}{coverage_suffix(flight.summary, 'errors')}"
     text = f"{flight.scenario.name}: {described} ({error})"
     return replace(verdict, text=text, step=None, label=label, line=colour)
 
 
-def _common_trim(scenarios: Sequence[Scenario]) -> dict[str, str]:
+def _label_of_v(scenarios: Sequence[Scenario]) -> dict[str, str]:
     """Return the axis label of V in a mapping with the key "V".
 
     The label states the trim speed if all flights have the same trim speed.
@@ -135,7 +136,7 @@ def _metrics(
     timed = TIMES if ticks else ()
     groups = [
         TableGroup(errors, "Tracking error", "", palette, errors_in_radians),
-        TableGroup(inputs, "Inputs", "u less its value at trim", palette, inputs_in_radians),
+        TableGroup(inputs, "Inputs", "u minus its value at trim", palette, inputs_in_radians),
         TableGroup(ticks, "Time", "", palette),
     ]
     return Figures(groups=groups, words=words_in([*headings, *timed]))

@@ -77,8 +77,8 @@ def read_accounted(
         run: Folder of a run, or a file of the bag.
         namespace: Namespace of the aircraft, for a log with several aircraft.
         scenario: Scenario file in place of the scenario in the log.
-        remaps: Topics of the log by the names that the nodes of this package give them, as in
-            {"y": "/sensors/y"}. They are needed if the nodes were remapped.
+        remaps: The names of topics in the log, by their names in this package, as in {"y":
+            "/sensors/y"}. They are needed if the nodes were remapped.
 
     Returns:
         The content of the log: a tape with signals of shape (N, k), SI, the scenario and the files.
@@ -110,9 +110,10 @@ def read_flight(
 ) -> RecordedFlight:
     """Read a recorded flight and summarise it, without writing a file.
 
-    If `outcome` is None, the flight keeps the outcome that its summary states. `namespace`,
-    `scenario` and `remaps` have the same meaning as in `read_run`. Raises ParameterError if the log
-    cannot be read or holds no scenario.
+    If `outcome` is None, the outcome is the one that the log, the summary or a launch stated, or
+    the one that the samples show. `namespace`, `scenario` and `remaps` have the same meaning as in
+    `read_accounted`. Raises ParameterError if the log cannot be read, or if it has no scenario and
+    was not imported, and UnflownError if it lacks y or y_m.
     """
     return flight_of(read_run(run, namespace, scenario, remaps), run, outcome)
 
@@ -139,9 +140,10 @@ def log_account(recorded: RecordedRun) -> Account | None:
 
 
 def scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
-    """Return the scenario that is stored in a log. The path of the scenario is beside the log.
+    """Return the scenario that is stored in a log.
 
-    Raises ParameterError if the log has no valid scenario.
+    Its relative paths begin in the folder of the log. Raises ParameterError if the log has no valid
+    scenario.
     """
     stored = recorded.scenario_file()
     return parse_scenario(stored.content, folder_of(run) / stored.name)
@@ -167,8 +169,8 @@ def _imported_flight(recorded: RecordedRun, name: str, source: Mapping[str, str]
     """Return the flight of an imported log. Only its y and u can be summarised."""
     recorded.require("y", "u")
     is_alone = recorded.scenario is None
-    expected = "none: nothing of a scenario was flown"
-    require(is_alone, "scenario", "an imported log", expected)
+    expected = "none: an imported log flew no scenario"
+    require(is_alone, "scenario", "a scenario for an imported log", expected)
     return RecordedFlight(
         name=name,
         scenario=None,
@@ -179,7 +181,7 @@ def _imported_flight(recorded: RecordedRun, name: str, source: Mapping[str, str]
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
-    """Return the flight of a user's own aircraft. The log has only its controller."""
+    """Return the flight of a user's own aircraft. The log describes only the controller."""
     recorded.require("y", "u")
     controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
     summary = summarise_own(recorded.tape, controller.law, name, outcome)
@@ -204,9 +206,9 @@ def _scenario_flight(
     tape = until_last_tick(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged_part = _engaged(tape, engagements or [])
-    # An engagement may be shorter than a sample.
-    has_figures = {"y", "y_m"} <= set(engaged_part.signals)
-    part = engaged_part if has_figures else tape
+    # A short engagement may contain no sample.
+    is_y_engaged = {"y", "y_m"} <= set(engaged_part.signals)
+    part = engaged_part if is_y_engaged else tape
     try:
         summary = summarise(part, scenario, outcome, flight_account)
     except ParameterError as error:
@@ -215,7 +217,7 @@ def _scenario_flight(
     if engagements is not None:
         summary["engagements"] = [_engagement(tape, engagement) for engagement in engagements]
         summary["notes"] = [
-            *engagement_notes(summary["engagements"], has_figures=has_figures),
+            *engagement_notes(summary["engagements"], is_y_engaged=is_y_engaged),
             *summary["notes"],
         ]
     controllers = _controllers(recorded, tape, scenario)
@@ -272,7 +274,8 @@ def _controllers(
 def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
     """Return the engaged part of a flight behind a bridge. The metrics are computed from this part.
 
-    If there was no engagement, the whole tape is returned, so that the duration is known.
+    Without engagements, as in every simulated flight, nothing is cut. Signals without samples are
+    left out.
     """
     end_ns = max(
         (int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)),
@@ -307,7 +310,7 @@ def _identity(recorded: RecordedRun) -> dict[str, Any]:
 
 
 def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> Outcome:
-    """Return the outcome of a flight that was stated earlier, or find it from the samples.
+    """Return the outcome that was stated earlier for a flight, or find it from the samples.
 
     The log, the summary and a launch can state an outcome. The first of them that does, in this
     order, is used. If nodes were started by hand, only the samples of the log show how the flight

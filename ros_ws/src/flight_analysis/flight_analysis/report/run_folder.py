@@ -27,7 +27,7 @@ PROVENANCE = "provenance.yaml"
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>.
 
-    Raises ParameterError if the folder cannot be created.
+    `kind` is a prefix such as "replay-". Raises ParameterError if the folder cannot be created.
     """
     place = str(runs.absolute())
     is_text = not any("\ud800" <= character <= "\udfff" for character in place)
@@ -36,14 +36,16 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     )
     latest = runs / "latest"
     is_free = latest.is_symlink() or not latest.exists()
-    require(is_free, str(latest), "a folder", "no file of this name: it becomes a link to the run")
+    require(
+        is_free, str(latest), "a file or folder", "none: this name is for a link to the newest run"
+    )
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}{scenario.name}"
     for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
         run = (runs / name).absolute()
         with writing("runs", runs, "a folder that can"), suppress(FileExistsError):
             run.mkdir(parents=True)
             return run
-    raise ParameterError(f"runs: found a hundred runs of this second in {runs}, expected fewer")
+    raise ParameterError(f"runs: found 99 runs in {runs} that began in this second, expected fewer")
 
 
 def remove_empty(*runs: Path) -> None:
@@ -63,7 +65,7 @@ def attachments_for(
     further: Sequence[Path] = (),
     replaced: Sequence[str] = (),
 ) -> LogAttachments:
-    """Return the files that the log of a flight attaches, and write those that do not exist yet.
+    """Write the files that describe a run, and return all files that its log attaches.
 
     The files are the scenario, the airframe or the user's model of JSBSim, every parameter after
     validation, the `further` files, and the provenance. New files are written into the folder of
@@ -72,7 +74,8 @@ def attachments_for(
     and the attachments state this. Raises ParameterError if a file cannot be written.
     """
     unflown = {
-        name: comment([f"did not fly: {name}; another node took its place"]) for name in replaced
+        name: comment([f"not started: {name}, because another node took its place"])
+        for name in replaced
     }
     parameters = "".join(unflown.values()) + scenario_yaml(scenario, overrides)
     attached = [_write(run / PARAMETERS, parameters), *further]

@@ -73,7 +73,7 @@ class RecordedFlight(NamedTuple):
     tape: Tape
     summary: dict[str, Any]  # the result of `summarise` or of `summarise_imported`
     si_units: Mapping[str, str] = {}  # units by channel of an imported flight
-    # the parameters that flew, if they changed in flight
+    # the parameters in use, one set after each change; empty if they never changed
     controllers: tuple[FlownController, ...] = ()
     later_aircraft: tuple[AircraftConfig, ...] = ()  # the aircraft after each change in flight
     messages: tuple[LogMessage, ...] = ()
@@ -192,7 +192,7 @@ def summarise(
         "account": flight_account.as_json(),
         "notes": [
             *busy_notes,
-            *late_u(scenario, age),
+            *late_u_notes(scenario, age),
             *(note for note in tape.notes if note != busy),
             *saturation_notes(tape),
             *([] if not_compared is None else [not_compared.note()]),
@@ -210,8 +210,8 @@ def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
     require(
         of_flight is not None,
         "scenario",
-        "none on the tape of a log",
-        "summarise(run.tape, recorded_scenario(run))",
+        "no scenario for the tape of a log",
+        "one as the second argument, such as recorded_scenario(run)",
     )
     return as_scenario(of_flight)
 
@@ -234,8 +234,8 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
     """Return the metrics of an imported log, whose flight was flown by another controller.
 
     The result has metrics of y and u about trim, and the numbers of samples by topic. Such a flight
-    has no reference y_m, so it has no error. `source` is the metadata record IMPORTED of `rise-di
-    import`.
+    has no reference y_m, so it has no error. `source` is the content of the metadata record
+    IMPORTED, which `rise-di import` writes.
     """
     flight_account = account(tape, None)
     deviations = {}
@@ -262,22 +262,22 @@ def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str,
     The errors are computed from the measured y. Nothing is judged, because there is no model of the
     aircraft.
     """
-    source = {"log": log, "kind": f"an aircraft of its own under the law {law}"}
+    source = {"log": log, "kind": f"the user's own aircraft, flown by the law {law}"}
     summary = summarise_imported(tape, source) | {"outcome": outcome.as_json()}
     if not {"y", "y_m"} <= tape.signals.keys():
         return summary
-    errors = replace(tape, signals={**tape.signals, "e": tracking_error(tape)})
-    by_channel = inputs_by_part(errors, (), topic="e")
+    with_error = replace(tape, signals={**tape.signals, "e": tracking_error(tape)})
+    by_channel = inputs_by_part(with_error, (), topic="e")
     deviations = {name: {"whole": asdict(parts["whole"])} for name, parts in by_channel.items()}
     return summary | {key: finite_or_null(value) for key, value in {"e": deviations}.items()}
 
 
-def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
-    """Return a sentence if u at the aircraft is older than `controller.delay` by a period or more.
+def late_u_notes(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
+    """Return a note, in a list, if u at the aircraft is much older than `controller.delay`.
 
-    The linear loop is computed with `controller.delay`. Any further delay uses up the delay margin
-    of this loop. The sentence states this margin. If there is no linear model, there is no
-    sentence.
+    There is a note from one period more on. The linear loop is computed with `controller.delay`,
+    and any further delay uses up the delay margin of this loop, which the note states. Without a
+    linear model there is no note.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
@@ -291,16 +291,12 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     except ParameterError:  # no linear model
         return []
     margin = delay_margin(linear.nominal, linear.law, linear.loop)
-    late = f"u is {1e3 * age.mean:.1f} ms old at the aircraft"
-    late_past_margin = age.mean - controller.delay - margin
-    designed = (
-        f"the gains are made for {1e3 * controller.delay:.1f} ms, with a delay margin of "
-        f"{1e3 * margin:.1f} ms"
-    )
+    late = age.mean - controller.delay
     return [
         (
-            f"{late}, {designed}: {'more than' if late_past_margin > 0.0 else 'within'} the "
-            "margin; see rise-di gains select --delay"
+            f"u is {1e3 * age.mean:.1f} ms old at the aircraft, which is {1e3 * late:.1f} ms more "
+            f"than the gains are made for: {'more than' if late > margin else 'within'} their "
+            f"delay margin of {1e3 * margin:.1f} ms; see rise-di gains select --delay"
         )
     ]
 
@@ -310,17 +306,19 @@ def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
     targets = sum(
         tape.recording[topic].found for topic in ("target", "route") if topic in tape.recording
     )
-    steps_taken = int(np.count_nonzero(tape["guidance"]["given"])) if "guidance" in tape else 0
+    steps_with_commands = (
+        int(np.count_nonzero(tape["guidance"]["given"])) if "guidance" in tape else 0
+    )
     return Commands(
         given=len(commands),
         flown=sum(start <= end for start in commands),
         targets=targets,
-        taken=steps_taken,
+        taken=steps_with_commands,
     )
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
-    """Say how many commands of a flight were not flown, and how many targets were given.
+    """Say how many commands of a flight were flown, if not all, and how many targets were given.
 
     An example is "8 of 24 commands flown". Returns "" if all commands were flown and no targets
     were given.
@@ -330,9 +328,8 @@ def command_results(summary: Mapping[str, Any]) -> str:
         return ""
     commands = flight_account.commands
     if commands.flown < commands.given:
-        parts = [
-            f"{commands.flown} of {commands.given} commands flown{taken_over(summary, 'commands')}"
-        ]
+        part = coverage_suffix(summary, "commands")
+        parts = [f"{commands.flown} of {commands.given} commands flown{part}"]
     else:
         parts = []
     if commands.targets:
@@ -351,9 +348,9 @@ def _with_late_ticks(
 ) -> Account:
     """Return the account with a sentence on the busy host if too many ticks had no new y.
 
-    The host is to blame for these ticks only if the log has every y, and if y comes at least about
-    as often as the controller ticks. In any other case, for example if y comes from outside this
-    package, the account is returned as it is.
+    The host is to blame for these ticks if the log lacks nothing that the host did send, if the
+    sensor of y drops no samples, and if y comes from this package, about as often as the controller
+    ticks or more often. In any other case the account is returned as it is.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -378,7 +375,10 @@ def _with_late_ticks(
 
 
 def _duration(tape: Tape, flight_account: Account) -> float | None:
-    """Return the flight time of the last y, s, or the end of the flight if the log lacks y."""
+    """Return the flight time of the last y, s.
+
+    If the log lacks some samples of y, this is the end of the flight. Without any y, it is None.
+    """
     if not len(tape["y"].stamp_ns):
         return None
     return flight_account.end if flight_account.over("y") else float(tape.time("y")[-1])
@@ -393,11 +393,11 @@ FIGURES = {
     "latency": ("y", "u"),
     "age_of_u": ("u",),
 }
-"""Topics that each table needs, besides `truth` for a true error. Some have the values of the
-table, and the others show the parts of the flight."""
+"""Topics from which each table is made, besides `truth` for a true error. They have the values of
+the table, or show the parts of the flight."""
 
 
-def taken_over(summary: Mapping[str, Any], table: str) -> str:
+def coverage_suffix(summary: Mapping[str, Any], table: str) -> str:
     """Say which part of the flight a table covers, as in ", over 49 % of truth".
 
     Returns "" if the table covers the whole flight.
@@ -409,19 +409,19 @@ def taken_over(summary: Mapping[str, Any], table: str) -> str:
 
 
 def is_in_host_time(summary: Mapping[str, Any]) -> bool:
-    """Return whether a flight was flown by its host's clock, so that its delays are known."""
+    """Return whether the stamps are times of the host's clock. Only then are delays measured."""
     return bool(summary["flight"]) and summary["flight"]["start_ns"] > SINCE_EPOCH_NS
 
 
 def time_flown(summary: Mapping[str, Any]) -> str:
     """Say how long the flight was, and which part of it the table of errors covers."""
-    return f"{format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
+    return f"{format_seconds(summary['duration'])} flown{coverage_suffix(summary, 'errors')}"
 
 
-def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
-    """Return sentences on the engagements of a flight behind a bridge.
+def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, is_y_engaged: bool) -> list[str]:
+    """Return sentences on the engagements of a flight that a bridge connected to an autopilot.
 
-    `has_figures` says whether a sample of y lies in an engagement. If none does, the summary has
+    `is_y_engaged` says whether a sample of y lies in an engagement. If none does, the summary has
     the metrics of the whole flight.
     """
     if not engagements:
@@ -437,13 +437,13 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
         *sentences,
         (
             "the figures are of the "
-            f"{'engaged time alone' if has_figures else 'whole flight: no y while engaged'}"
+            f"{'engaged time alone' if is_y_engaged else 'whole flight: no y while engaged'}"
         ),
     ]
 
 
 def mode_notes(tape: Tape, part: str) -> list[str]:
-    """Return a sentence if the law was not engaged in more than 1 % of the ticks.
+    """Return a note, in a list, if over 1 % of the ticks had another mode than ENGAGED.
 
     The ticks from the first engagement on are examined. `part` says which part of the ticks the log
     has, as in "over 49 % of internals", or is "" if the log has all ticks.
@@ -454,13 +454,13 @@ def mode_notes(tape: Tape, part: str) -> list[str]:
     ticks = mode[np.argmax(is_engaged) :]
     if not is_engaged.any() or np.mean(ticks == Mode.ENGAGED) >= WHOLE:
         return []
-    absent = [state for state in Mode if state is not Mode.ENGAGED and state in ticks]
-    modes = ", ".join(f"{state.name} in {np.mean(ticks == state):.0%}" for state in absent)
+    others = [state for state in Mode if state is not Mode.ENGAGED and state in ticks]
+    modes = ", ".join(f"{state.name} in {np.mean(ticks == state):.0%}" for state in others)
     over = f", {part}" if part else ""
     return [
         (
-            f"the controller was {modes} of the ticks{over}: the figures are of the whole flight, "
-            "with u held or at trim"
+            f"the controller was {modes} of the ticks{over}: the figures include these ticks, in "
+            "which u was held or at trim"
         )
     ]
 
@@ -476,8 +476,8 @@ def vane_notes(tape: Tape) -> list[str]:
     t = tape.time("internals")
     notes = []
     for name in measures.names:
-        changes = np.flatnonzero(measures[name] != 0.0)
-        since = float(t[changes[-1]] if len(changes) else t[0])
+        in_use = np.flatnonzero(measures[name] != 0.0)
+        since = float(t[in_use[-1]] if len(in_use) else t[0])
         if t[-1] - since > STANDS_STILL:
             notes.append(
                 f"vane {name} stands still from t = {since:.1f} s on and is left out: frozen, "

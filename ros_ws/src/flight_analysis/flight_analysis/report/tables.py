@@ -18,7 +18,7 @@ from flight_analysis.report.display_units import DisplayUnit, format_seconds, fo
 from flight_analysis.report.glossary import legend, words_in
 from flight_analysis.report.guided import landing_results, leg_results
 from flight_analysis.report.intervals import flight_end, gust_intervals, mode_intervals
-from flight_analysis.report.summary import is_in_host_time, taken_over, time_flown
+from flight_analysis.report.summary import coverage_suffix, is_in_host_time, time_flown
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -216,13 +216,13 @@ def metric_tables(
     tables = (
         _error_table(summary, units),
         MetricTable(
-            f"Inputs{taken_over(summary, 'inputs')}",
+            f"Inputs{coverage_suffix(summary, 'inputs')}",
             inputs,
             input_rows(summary, units),
-            "u less its value at trim",
+            "u minus its value at trim",
         ),
         _guidance_table(summary, units),
-        model_table(summary["models"], units, taken_over(summary, "errors")),
+        model_table(summary["models"], units, coverage_suffix(summary, "errors")),
         _tick_table(summary),
     )
     return [table for table in tables if table.rows]
@@ -240,7 +240,7 @@ def flight_tables(
         for event in event_list
     ]
     others = (
-        MetricTable(f"Events{taken_over(summary, 'ticks')}", times, rows),
+        MetricTable(f"Events{coverage_suffix(summary, 'ticks')}", times, rows),
         _process_table(summary),
     )
     return [*metric_tables(summary, units), *(table for table in others if table.rows)]
@@ -296,7 +296,7 @@ def _guidance_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
     guidance = summary["guidance"] or {"segments": (), "legs": ()}
     columns, rows = segment_table(guidance["segments"], units)
     results = (landing_results(guidance.get("landing")), leg_results(guidance["legs"]))
-    caption = f"Guidance by segment{taken_over(summary, 'guidance')}"
+    caption = f"Guidance by segment{coverage_suffix(summary, 'guidance')}"
     return MetricTable(caption, columns, rows, sentences(*results), of_rows=("segment",))
 
 
@@ -317,10 +317,10 @@ def model_table(
 
 def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
     """Return the table of the controller's timing. Without the host's clock, it has no times."""
-    caption = f"Ticks of the controller{taken_over(summary, 'ticks')}"
+    caption = f"Ticks of the controller{coverage_suffix(summary, 'ticks')}"
     rows = []
     for topic, label, text in timing_rows(summary, is_timed=is_in_host_time(summary)):
-        part = "" if topic == "ticks" else taken_over(summary, topic)
+        part = "" if topic == "ticks" else coverage_suffix(summary, topic)
         rows.append((f"{label}{part}", text))
     labels = [label for label, _ in rows]
     of_rows = [word for word in TIMES if any(label.startswith(word) for label in labels)]

@@ -175,7 +175,7 @@ def fly(
     for run in (schedule or schedule_of_device())(course):
         # The branches of an allocation are not unrolled, because they would then compile for
         # minutes.
-        looped = run if vehicle.allocation is None else run._replace(unroll=1)
+        looped = run if vehicle.allocation is None else run._replace(patterns_per_step=1)
         state = batch_loop.fly_run(state, constants, segments, k, run=looped, **compiled)
         k += run.length
     return figures(state, k, course.period)

@@ -179,7 +179,8 @@ def fly_run(
             now = tick(now, at_tick, kind, constants, control_law, timing)
         return now, None
 
-    return jax.lax.scan(pattern, state, jax.tree.map(patterns, segments), unroll=run.unroll)[0]
+    grouped = jax.tree.map(patterns, segments)
+    return jax.lax.scan(pattern, state, grouped, unroll=run.patterns_per_step)[0]
 
 
 def _chosen(

@@ -16,12 +16,12 @@ import numpy as np
 from flight_campaign.batch.campaign_course import ENGAGE, Course
 
 RUN = 120
-"""Largest number of ticks of a run. If forcing acts at one of its ticks, the whole run counts as
-forced."""
+"""Largest number of ticks of a run without branches. If forcing acts at one of its ticks, the whole
+run counts as forced."""
 
 UNROLL = 4
-"""Ticks in a step of the loop. On one H200, 250,000 flights of 60 s took 3.3 s with 1 tick, and 1.8
-s with 4 or 8. The compilation took 3 s with 1 tick, 7 s with 4, and 14 s with 8."""
+"""Least number of ticks in a step of the loop. On one H200, 250,000 flights of 60 s took 3.3 s with
+1 tick, and 1.8 s with 4 or 8. The compilation took 3 s with 1 tick, 7 s with 4, and 14 s with 8."""
 
 LONGEST = 20  # number of ticks of the longest pattern; a pattern is compiled tick by tick
 
@@ -47,7 +47,7 @@ class TickRun(NamedTuple):
 
     length: int  # number of ticks, a multiple of the pattern's length
     pattern: tuple[TickKind, ...]
-    unroll: int  # number of patterns in a step of the loop
+    patterns_per_step: int  # of the loop
 
 
 Schedule = Callable[[Course], Iterator[TickRun]]

@@ -31,7 +31,7 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.response_identification import BRIDGED
 
 STEP = 0.004  # s, step of the simulation
-# s, time before and after the excitation of an input that counts too
+# s; samples from this long before the excitation of an input to this long after it are used, too
 BEFORE = 0.3
 AFTER = 0.5
 MIN_CERTAINTY = 5.0  # an estimate is certain if it is at least this many standard errors
@@ -41,8 +41,9 @@ LOOP_FREQUENCY = 0.5
 MAX_ZERO_LAG = 0.5  # largest product of zero and lag; at 1 zero and lag would cancel
 # 1/s, fastest zero that a feedforward of 100 Hz follows (rise_di_controller.params, _check_nominal)
 FASTEST_ZERO = 25.0
-# A model of second order must lower the misfit to this share. Noise alone does not do so in 10 s.
-MIN_GAIN = 0.85
+# A second-order model is taken if its misfit is below this fraction of the first-order model's.
+# Noise alone does not cause such a fraction in 10 s.
+LARGEST_MISFIT_RATIO = 0.85
 # Starts of the search: delay s, lag s, damping 1/s, stiffness 1/s^2 and zero 1/s. They are a
 # short-period or Dutch roll mode of a transport, the same mode behind slow servos, and such a mode
 # of a model aircraft.
@@ -77,7 +78,7 @@ class ChannelModel(NamedTuple):
     stiffness: float  # 1/s^2; 0 if the first order is enough
     slow: float
     covariance: FloatArray  # (6, 6)
-    misfit: float  # rms of the output error divided by the rms of y
+    misfit: float  # rms of the output error divided by the rms of y without its trend
 
     @property
     def is_usable(self) -> bool:
@@ -131,7 +132,7 @@ def fit_channel(
     *,
     first_order: bool = False,
 ) -> ChannelModel | None:
-    """Fit a channel's model to the time of its excitation, with the lowest order that suffices.
+    """Fit a channel's model to the samples of its excitation, with the lowest sufficient order.
 
     Returns None if there is no excitation, or if the output is constant. The search begins with an
     Omega of the sign `sign`, and may end with the opposite sign. `gravity` is a channel that
@@ -151,7 +152,7 @@ def fit_channel(
         return None
     t = (y_of_channel.stamp_ns[is_settled] - first) / NANOSECONDS
     t_u = (u.stamp_ns - first) / NANOSECONDS
-    # u and gravity act through their integrals.
+    # u and gravity are resampled by their integrals, so that no short pulse is lost.
     impulse = np.concatenate([[0.0], np.cumsum(u[name][:-1] * np.diff(t_u))])
     trend = [np.ones(len(t)), t]
     if gravity is not None:
@@ -178,7 +179,11 @@ def fit_channel(
         _search(residuals, values, order, sign * float(np.max(np.abs(u[name])))) for order in orders
     ]
     misfits = [float(np.linalg.norm(fit.fun) / np.linalg.norm(values)) for fit in fits]
-    chosen = 1 if misfits[-1] < MIN_GAIN * misfits[0] and _has_zero_of_its_own(fits[-1].x) else 0
+    chosen = (
+        1
+        if misfits[-1] < LARGEST_MISFIT_RATIO * misfits[0] and _has_zero_of_its_own(fits[-1].x)
+        else 0
+    )
     return _model(fits[chosen], misfits[chosen], float(np.median(np.diff(t))))
 
 
@@ -192,10 +197,9 @@ def _is_settled(t: FloatArray) -> NDArray[np.bool_]:
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """Return a function of time that is fitted in addition to a constant and t.
+    """Return (exp(-d t) - 1 + d t) / d^2 at the times t with d = `damping`, or t^2 / 2 for d = 0.
 
-    The function describes the decay of an initial value, exp(-damping t). If the damping is 0, the
-    function is t^2 / 2.
+    With a constant and t, it can represent the decay exp(-d t) of an initial value.
     """
     x = damping * t
     return np.where(x > 1e-4, (np.expm1(-x) + x) / max(damping, 1e-9) ** 2, 0.5 * t**2)
@@ -246,15 +250,16 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
     best = min(fits, key=lambda fit: float(fit.cost))
     if order == ORDERS[0] and best.x[1] * best.x[3] > 1.0:
         delay, lag, Omega, damping = best.x
-        # This model has the same response.
+        # With the lag and 1 / damping exchanged, the response is the same.
         best = search(np.array([delay, 1.0 / damping, Omega / (lag * damping), 1.0 / lag]))
     return best
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
-    """Convert a fit to the model of a channel, whose standard errors allow for coloured errors.
+    """Convert a fit to the model of a channel.
 
-    Source: L. Ljung, 9.4 (coloured errors).
+    Its standard errors are larger if the errors are correlated in time. Source: L. Ljung, 9.4
+    (coloured errors).
     """
     e = fit.fun
     lags = max(round(CORRELATION / period), 1)

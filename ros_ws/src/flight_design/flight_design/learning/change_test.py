@@ -207,7 +207,7 @@ class Effects(Search):
         best = least_of(self.least(lower=lower), self.least(same.theta, lower))
         for j in range(self.count):
             theta = np.where(np.arange(len(self.prior)) == j, DEAD, 0.0)
-            if self.cost(theta, self.known()) < best.J + CLOSE:
+            if self.cost(theta, self.is_known()) < best.J + CLOSE:
                 best = least_of(best, self.least(theta, lower))
         return best
 
@@ -231,7 +231,7 @@ class Effects(Search):
         theta = np.clip(
             np.zeros(len(self.prior)) if theta is None else theta, self._lower, self._upper
         )
-        used = self.known()
+        used = self.is_known()
         free = np.ones(len(theta), dtype=bool)
         for _ in range(STEPS):
             winds = self.levels(theta) if levels is None else levels

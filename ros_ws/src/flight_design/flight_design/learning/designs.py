@@ -21,7 +21,7 @@ from flight_design.gains.observer_search import RESOLUTION, SelectedObserver
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
 from flight_design.identification.likelihood import PRIOR
 from rise_di_controller.learning.learned_channels import with_channels_of
-from rise_di_controller.rise_di_config import LEAST_MARGIN, RiseDiConfig
+from rise_di_controller.rise_di_config import DEFAULT_MARGIN, RiseDiConfig
 
 # s, delay margin that is kept beyond the latest delay. A loop with 30 ms flew well while u was 20
 # ms late.
@@ -162,7 +162,7 @@ def goal(
       controller with which the flight started.
     - With a design for the airframe file (`file`), it is the margin that the loop with this design
       has around the learned model, but at most the margin at the start of the flight. A learned
-      part needs at least LEAST_MARGIN, or the margin at the start if this is smaller.
+      part needs at least DEFAULT_MARGIN, or the margin at the start if this is smaller.
 
     A `dead` output flies without this design, so it needs no margin. In any case an input must
     tolerate DELAY_LEFT, s, beyond its `latest` delay, s. With a design for the file, the
@@ -186,7 +186,7 @@ def goal(
             kept = delay_margin(linear.nominal, linear.law, undelayed, share)
             kept = min(kept, margin_of(start)) - RESOLUTION
             if part in parts:
-                kept = max(kept, min(LEAST_MARGIN, margin_of(start)))
+                kept = max(kept, min(DEFAULT_MARGIN, margin_of(start)))
             else:
                 kept -= RESOLUTION  # The gains of this part stay, and with them its margin.
             margin = np.where(share > 0.0, max(kept, 0.0), margin)

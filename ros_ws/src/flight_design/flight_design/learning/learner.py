@@ -71,7 +71,7 @@ from flight_design.learning.part_checks import (
     without_effect,
 )
 from rise_di_controller.learning.learned_channels import (
-    outputs_without,
+    outputs_given_up,
     without_models,
 )
 from rise_di_controller.learning.proposals import UNVERIFIED
@@ -164,7 +164,7 @@ class Learner:
         # Inputs that had no effect in the last test. In a single test a gust can hide an effect.
         self._suspected: dict[PartName, str] = {}
         self._has_ended = False
-        self._give_up(outputs_without(controller))
+        self._give_up(outputs_given_up(controller))
         self._changed: set[PartName] = set()  # parts whose model was identified before a change
         self._last = controller  # the last proposal
         self._proposed = controller.digest()  # digest of the last proposal
@@ -399,7 +399,7 @@ class Learner:
         If the flown parameters differ from the last proposal only in these outputs, the proposal
         flies. If they also differ elsewhere, the proposal was refused.
         """
-        if set(outputs) <= set(outputs_without(self._start)):
+        if set(outputs) <= set(outputs_given_up(self._start)):
             return
         self._give_up(outputs)
         flying = without_models(self._controller, self._last, outputs)
@@ -411,7 +411,7 @@ class Learner:
         """Leave some outputs to the flight's initial law from now on: extend `learn.without`."""
         self._start = without_models(self._controller, self._controller, outputs)
         if outputs:
-            part = outputs_without(self._start)
+            part = outputs_given_up(self._start)
             self._dead[part] = None
             self._known = {
                 names: known for names, known in self._known.items() if not is_within(names, part)

@@ -41,9 +41,9 @@ from flight_guidance.steering.attitude import BodyRates, body_rates, load_slope,
 from flight_guidance.steering.lateral import heading_estimate, slip_estimate
 from flight_guidance.steering.path import Route, Side
 from flight_guidance.steering.vertical import (
+    airspeed_increase_for,
     alpha_estimate,
     climb_for,
-    climb_speed,
     path_angle,
     pitch_for,
     slewed,
@@ -224,7 +224,7 @@ def command(
 
     V_asked = state.target.V
     if flies and "q" in params.dead:
-        V_asked = V_asked + climb_speed(climb_c - pose["climb"], speed)
+        V_asked = V_asked + airspeed_increase_for(climb_c - pose["climb"], speed)
     V_wanted = permitted_speed(V_asked, params)
     V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
 

@@ -16,15 +16,15 @@ ratio 7, C_Lmax is 1.45, and by lifting-line theory C_Lalpha is 4.9 1/rad."""
 
 
 CLIMB_BANDWIDTH = 0.4
-"""Bandwidth of the climb rate that the airspeed controls, 1/s. It is a third of the osprey's
-bandwidth of V. At this frequency the loop of V adds 37 deg of lag."""
+"""Bandwidth of the loop in which the airspeed controls the climb rate, 1/s. It is a third of the
+osprey's bandwidth of V, where the second-order loop of V adds 2 atan(1/3) = 37 deg of lag."""
 
 
 class VerticalParams(NamedTuple):
     """Gains and limits of the vertical loop."""
 
     k_h: float  # 1/s
-    acceleration: float  # permitted vertical acceleration a, m/s^2
+    acceleration: float  # vertical acceleration a, of which `climb_for` uses half, m/s^2
     climb: float  # largest climb rate, m/s
     sink: float  # largest sink rate, m/s
     alpha_time: float  # time constant of the angle of attack's low-pass, s
@@ -33,12 +33,11 @@ class VerticalParams(NamedTuple):
 def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
     """Compute the climb rate, m/s, for an altitude error (command minus altitude), m.
 
-    The rate stays between -sink and climb:
+        k_h e                                  if abs(e) <= e_l = a / (2 k_h^2)
+        sign(e) sqrt(a (abs(e) - e_l / 2))     if abs(e) > e_l
 
-        k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
-
-    The two branches and their slopes agree at e_l. Far away the climb rate falls by a / 2 per
-    second, which the aircraft can follow.
+    The result is limited to the range from -sink to climb. The two branches and their slopes agree
+    at e_l. Far away the climb rate falls by a / 2 per second, which the aircraft can follow.
     """
     k_h = params.k_h
     a = params.acceleration
@@ -75,7 +74,7 @@ def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
     return path_angle(climb, speed) + alpha
 
 
-def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
+def airspeed_increase_for(error: Scalar, speed: Scalar) -> Scalar:
     """Compute by how much to fly faster to correct an error of the climb rate, m/s.
 
     This serves an aircraft without an elevator. The increase is K V / (2 g) error. At a constant

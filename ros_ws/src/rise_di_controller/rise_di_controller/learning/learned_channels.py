@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Combine channels that use a learned model with channels that fly the initial law.
+"""Combine channels that use a learned model with channels that the initial law controls.
 
 The initial law is the law with which the flight started.
 """
@@ -25,10 +25,10 @@ def with_channels_of(
 
     These channels get no feedforward and no observer. The result is not checked.
 
-    By equation (22), the K of a channel cannot be below the K of the last channel. If the K in
-    `start` is below it, the channel gets the K of the last channel and a smaller input scale, which
-    gives the same loop. The inputs that `dead` marks have no effect. They get the least input
-    scale, so that the law does not move them.
+    By equation (22), no K may be below the K of the last channel. If the K in `start` is below the
+    last K of `designed`, the channel gets a K slightly above this last K. Its input_scale, omega
+    and beta are then scaled so that the loop stays the same. The inputs that `dead` marks have no
+    effect. They get the least input scale, so that the law does not move them.
     """
     law = start.law_params()
     design = designed.law_params()
@@ -107,7 +107,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     s_i is the standard deviation of Omega_ii divided by abs(Omega_ii). For a small s_i the factor
     subtracts two deviations, and for any s_i it stays above 0. If there are models at other speeds,
     the least value over the speeds is returned. The result is 0 for an input without effect. It is
-    UNKNOWN if the input has no limit, or if no learned model flies in the output.
+    UNKNOWN if the input has no limit, or if the output does not use a learned model.
     """
     m = len(parameters.outputs)
     model = parameters.feedforward
@@ -136,7 +136,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
-    """Return parameters in which the channels `bare` fly the initial law again.
+    """Return parameters in which the initial law controls the channels `bare` again.
 
     If no channel keeps a learned model, the result is `start` itself.
     """
@@ -152,8 +152,8 @@ def with_fallback(
     return RiseDiConfig.validate_mapping(mixed.model_dump(), "controller", check=False)
 
 
-def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
-    """Return the outputs in `learn.without`, which have no model until the engagement ends."""
+def outputs_given_up(parameters: ControllerConfig) -> tuple[str, ...]:
+    """Return the outputs in `learn.without`, which get no learned model until the law restarts."""
     learn = parameters.learn if isinstance(parameters, RiseDiConfig) else None
     return () if learn is None else learn.without or ()
 
@@ -163,13 +163,13 @@ def without_models(
 ) -> RiseDiConfig:
     """Return parameters in which some outputs no longer use their learned model.
 
-    These outputs fly the initial law until the engagement ends, and their names are added to
+    The initial law controls these outputs until the law restarts, and their names are added to
     `learn.without`.
     """
     fallen = with_fallback(start, parameters, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns
     bare_outputs = tuple(
-        name for name in start.outputs if name in {*outputs_without(parameters), *outputs}
+        name for name in start.outputs if name in {*outputs_given_up(parameters), *outputs}
     )
     return fallen.model_copy(
         update={"learn": start.learn.model_copy(update={"without": bare_outputs or None})}
@@ -179,7 +179,8 @@ def without_models(
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
     """Return a mask, (m,), of the outputs that the model couples with the outputs `names`.
 
-    The model is the nominal model of the feedforward.
+    Two outputs are coupled directly, or through other states. The model is the nominal model of the
+    feedforward.
     """
     model = parameters.feedforward
     assert model is not None  # noqa: S101 - a learned model flies

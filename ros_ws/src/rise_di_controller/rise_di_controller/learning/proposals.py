@@ -20,7 +20,7 @@ from rise_di_controller.controller import Controller, Prepared, prepared, prepar
 from rise_di_controller.learning.learned_channels import (
     authority,
     coupled,
-    outputs_without,
+    outputs_given_up,
     with_fallback,
     without_models,
 )
@@ -260,7 +260,7 @@ class Learning:
         ]
         self._fallbacks.update(part)
         ends = [name for name in part if self._fallbacks[name] >= FALLBACKS]
-        fallen = without_models(self.start, self.start, {*outputs_without(parameters), *ends})
+        fallen = without_models(self.start, self.start, {*outputs_given_up(parameters), *ends})
         lasting = f", in {', '.join(ends)} to the end of the engagement" * bool(ends)
         reason = " and ".join(f"{name} diverges{' again' * bool(ends)}" for name in diverging)
         self._fallback = Fallback(controller.digest, parameters.input_scale, fallen.digest())
@@ -307,9 +307,9 @@ class Learning:
         self._received.clear()
         self._fallbacks.clear()
         self._diverged.clear()
-        if not controller.has_learned_model and outputs_without(
+        if not controller.has_learned_model and outputs_given_up(
             controller.parameters
-        ) == outputs_without(self.start):
+        ) == outputs_given_up(self.start):
             return None
         what = "goes back to the initial law: it was deactivated"
         self._take(controller, now_ns, prepared(self.start), EventKind.RESTART, what)
@@ -381,7 +381,7 @@ class Learning:
                     "found parameters that diverged in this engagement, expected others"
                 )
             if refusal is None:
-                bare_outputs = ", ".join(outputs_without(end.value.parameters))
+                bare_outputs = ", ".join(outputs_given_up(end.value.parameters))
                 exception = f", without {bare_outputs}" if bare_outputs else ""
                 what = f"flies {proposal.sentence or 'the proposal'}{exception}"
                 self._take(controller, now_ns, end.value, EventKind.FLIES, what)
@@ -477,7 +477,7 @@ def _certificate(
         f"{margin:g} s",
         f"at least {least:g} s",
     )
-    if bare_outputs := outputs_without(parameters):
+    if bare_outputs := outputs_given_up(parameters):
         others = f"one of other outputs than {', '.join(bare_outputs)}, by learn.without"
         require(proposed.feedforward is not None, "proposal", "no feedforward", others)
         bare = coupled(proposed, bare_outputs)
