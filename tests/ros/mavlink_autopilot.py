@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated autopilot with ArduPilot's MAVLink interface, as a process.
+"""Simulate an autopilot with ArduPilot's MAVLink interface, as a process.
 
 python -m tests.ros.mavlink_autopilot SCENARIO PORT
 

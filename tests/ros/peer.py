@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A peer of a node under test.
+"""Provide a peer of a node under test.
 
 It publishes y and y_m, subscribes to topics of the node, and calls its services.
 """
@@ -35,7 +35,7 @@ INPUTS = ("elevator", "thrust", "aileron", "rudder")
 
 
 def stamp_ns(message: Any) -> int:
-    """The stamp of a message with a header."""
+    """Return the stamp of a message with a header."""
     return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
@@ -63,7 +63,7 @@ class Peer:
         each: Callable[[], object] | None = None,
         timeout: float = HANG,
     ) -> T:
-        """Spin until a condition is true; what it returned. `each` is called every 5 ms."""
+        """Spin until a condition is true, and return its value. `each` is called every 5 ms."""
 
         def serve() -> None:
             end = time.monotonic() + LOOK
@@ -76,17 +76,17 @@ class Peer:
         return until(condition, because, serve, timeout)
 
     def last(self, topic: str) -> Any:
-        """The newest message of a topic; None before the first."""
+        """Return the newest message of a topic, or None before the first."""
         return next(reversed(self.received[topic]), None)
 
     def send(self, y: float = 0.0, y_m: float = 0.0) -> None:
-        """Publish one sample of y and one of y_m, with equal channels, stamped now."""
+        """Publish a sample of y and one of y_m, with equal channels and the present stamp."""
         now_ns = time.time_ns()
         for name, value in (("y_m", y_m), ("y", y)):
             self.publish(name, to_message(now_ns, OUTPUTS, np.full(4, value), "peer"))
 
     def command(self, *u: float, sender: str = "peer", age: float = 0.0) -> None:
-        """Publish u, stamped `age` s ago."""
+        """Publish u with a stamp `age` s ago."""
         self.publish(
             "u", to_message(time.time_ns() - nanoseconds(age), INPUTS, np.array(u), sender)
         )
@@ -100,7 +100,7 @@ class Peer:
     def call(
         self, kind: Any, name: str, request: Any, each: Callable[[], None] | None = None
     ) -> Any:
-        """Call a service and wait for its answer; `each` is called every 5 ms meanwhile."""
+        """Call a service and wait for its answer. Meanwhile `each` is called every 5 ms."""
         client = self.node.create_client(kind, name)
         self.until(client.service_is_ready, f"the service {name}", each=each)
         future = client.call_async(request)
@@ -108,12 +108,12 @@ class Peer:
         return future.result()
 
     def transition(self, number: int) -> bool:
-        """Request a transition of the controller; whether it succeeded."""
+        """Request a transition of the controller, and return whether it succeeded."""
         request = ChangeState.Request(transition=Transition(id=number))
         return bool(self.call(ChangeState, "controller/change_state", request).success)
 
     def set_parameters(self, **values: object) -> bool:
-        """Set parameters of the controller at once; whether it took them."""
+        """Set parameters of the controller at once, and return whether it accepted them."""
         messages = [
             Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
         ]
@@ -125,7 +125,7 @@ class Peer:
         )
 
     def counted(self, key: str, more_than: int = 0) -> bool:
-        """Whether a counter in the received diagnostics has been above a number."""
+        """Return whether a counter in the received diagnostics has been above a number."""
         values = [
             value
             for array in self.received["/diagnostics"]
@@ -135,7 +135,7 @@ class Peer:
         return any(value.key == key and int(value.value) > more_than for value in values)
 
     def modes(self) -> list[int]:
-        """The sequence of modes in `internals`, without repetitions."""
+        """Return the sequence of modes in `internals`, without repetitions."""
         modes = [
             int(message.position[message.name.index("mode")])
             for message in self.received["internals"]
@@ -143,7 +143,7 @@ class Peer:
         return [mode for index, mode in enumerate(modes) if index == 0 or modes[index - 1] != mode]
 
     def u(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """All received inputs, shape (N, m)."""
+        """Return all received inputs, (N, m)."""
         return np.array([message.position for message in self.received["u"]])
 
 
@@ -151,7 +151,7 @@ class Peer:
 def peer(
     topics: tuple[str, ...] = ("u", "internals", "/diagnostics"), qos: QoSProfile | None = None
 ) -> Iterator[Peer]:
-    """A peer in its own context with subscriptions to these topics."""
+    """Yield a peer in its own context with subscriptions to these topics."""
     transport.prepare()
     context = Context()
     rclpy.init(context=context)

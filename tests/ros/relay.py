@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A network between the network namespaces of two processes, with delay and loss.
+"""Connect the network namespaces of two processes by a network with delay and loss.
 
 python -m tests.ros.relay PID PID DELAY LOSS
 
-It forwards the packets of two TUN devices, `net0` in each namespace, after DELAY s; a share LOSS is
-lost. It prints "up" once the devices exist. SIGUSR1 pulls the cable for a second.
+It forwards the packets of two TUN devices, `net0` in each namespace, after DELAY s. A share LOSS is
+lost. It prints "up" when the devices exist. SIGUSR1 pulls the cable for a second.
 """
 
 import ctypes
@@ -27,7 +27,10 @@ NAME = "net0"
 
 
 def device(pid: int) -> int:
-    """A TUN device in the network namespace of a process. Raises OSError without the permission."""
+    """Return a TUN device in the network namespace of a process.
+
+    Raises OSError without the permission.
+    """
     libc = ctypes.CDLL(None, use_errno=True)
     with (
         Path("/proc/self/ns/net").open("rb") as own_namespace,

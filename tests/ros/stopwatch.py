@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measures the age of u on the host of the aircraft, beside what the aircraft tells.
+"""Measure the age of u on the aircraft's host, to compare it with what the aircraft tells.
 
-It needs rclpy alone. As a process, python -m tests.ros.stopwatch. It prints "told MEAN measured
-MEAN", s, for each report of the aircraft.
+It needs only rclpy, and runs as python -m tests.ros.stopwatch. It prints "told MEAN measured MEAN",
+s, for each report of the aircraft.
 """
 
 import rclpy
@@ -16,7 +16,7 @@ KEY = "age of u mean (s)"
 
 
 class Stopwatch(Node):  # type: ignore[misc]
-    """The ages of the u since the last report."""
+    """The ages of all u since the last report."""
 
     def __init__(self) -> None:
         super().__init__("stopwatch")

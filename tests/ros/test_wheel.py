@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The wheel, built and installed beside strangers, flies, reports and replays."""
+"""Test that the wheel, installed among packages with its names, flies, reports and replays."""
 
 import os
 import subprocess
@@ -21,7 +21,7 @@ Run = Callable[..., str]
 
 
 def write_package(folder: Path, name: str) -> None:
-    """A package that cannot be imported, and the metadata of an installation of it."""
+    """Write a package that cannot be imported, and the metadata of its installation."""
     for path, text in {
         f"{name}/__init__.py": DECOY,
         f"{name}-9.9.dist-info/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: 9.9\n",
@@ -32,9 +32,9 @@ def write_package(folder: Path, name: str) -> None:
 
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
-    """The folder that holds the installed wheel, and a foreign package of the name guidance.
+    """Return the folder of the installed wheel, which also has a foreign package named guidance.
 
-    PyPI has one of that name.
+    PyPI has a package with this name.
     """
     built = tmp_path / "built"
     target = tmp_path / "installed"
@@ -60,9 +60,9 @@ def installed(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Runs Python with the wheel.
+    """Return a function that runs Python with the wheel.
 
-    Strangers of all names are in the working folder and behind the wheel on the path.
+    Foreign packages of all names are in the working folder, and behind the wheel on the path.
     """
     behind = tmp_path / "behind"
     working = tmp_path / "working"
@@ -83,7 +83,7 @@ def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run
 
 
 def test_the_wheel_flies_beside_strangers(installed: Path, run: Run) -> None:
-    """Every package is that of the wheel.
+    """Every imported package comes from the wheel.
 
     In one process, and as four processes over DDS, the replay is equal to the bit.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The one way of a test in real time to wait, and the delays of the host that it allows for."""
+"""Provide the only way in which a test in real time waits, and the delays that it allows for."""
 
 import threading
 import time
@@ -16,10 +16,10 @@ LOOK = 0.005  # s, between two looks at a condition
 
 
 class HostDelays(threading.Thread):
-    """Delays of the host, as a thread sees them that is due every 10 ms.
+    """Delays of the host, measured by a thread that is due every 10 ms.
 
     All processes of a test have them. What this process itself computes meanwhile is no delay of
-    the host: another thread may have held the interpreter.
+    the host, because another thread may have held the interpreter.
     """
 
     def __init__(self) -> None:
@@ -39,11 +39,11 @@ class HostDelays(threading.Thread):
                 self._delays.append((begin, delay))
 
     def since(self, t: float) -> float:
-        """Sum of the delays that ended after an instant of the system clock, s."""
+        """Return the sum of the delays that ended after an instant of the system clock, s."""
         return sum(delay for end, delay in self._delays if end > t)
 
     def longest(self, t: float) -> float:
-        """The longest of the delays that ended after an instant of the system clock, s."""
+        """Return the longest delay that ended after an instant of the system clock, s."""
         return max((delay for end, delay in self._delays if end > t), default=0.0)
 
 
@@ -58,7 +58,7 @@ class Logging(Protocol):
 
     @property
     def output(self) -> str:
-        """What it has printed."""
+        """Return what it has printed."""
 
 
 running: list[Logging] = []
@@ -71,11 +71,11 @@ def until(
     each: Callable[[], object] = lambda: time.sleep(LOOK),
     timeout: float = HANG,
 ) -> T:
-    """Wait until a condition is true; what it returned.
+    """Wait until a condition is true, and return its value.
 
     `each` is called between two looks and takes some milliseconds. `because` says what the test
-    waits for. The limit grows by the delays of the host. A wait that ends without the condition
-    fails with the output of all processes of the test.
+    waits for. The limit grows by the delays of the host. If the wait ends without the condition,
+    the test fails with the output of all its processes.
     """
     begin = time.monotonic()
     began = time.time()

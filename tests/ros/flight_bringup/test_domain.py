@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A second flight in a domain is refused before any of its nodes starts."""
+"""Test that a second flight in a domain is refused before any of its nodes starts."""
 
 import time
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ FLEET = "scenario: osprey_gust\naircraft: {uav1: {}}\n"
 
 
 def publish(made: Peer, *topics: str) -> None:
-    """A sample of an aircraft and of a reference model of another flight."""
+    """Publish a sample of an aircraft and of a reference model of another flight."""
     for topic in topics:
         made.publish(topic, to_message(time.time_ns(), OUTPUTS, np.zeros(4), f"{topic}#1"))
 
@@ -42,7 +42,7 @@ def publish(made: Peer, *topics: str) -> None:
 def test_second_flight_refused_before_its_controller_publishes_u(
     words: Sequence[str], topics: tuple[str, str, str], status: int, start: Start, tmp_path: Path
 ) -> None:
-    """An aircraft of one's own, without a lock, would fly the u of the second controller."""
+    """A user's aircraft without a publisher lock would fly the u of the second controller."""
     (tmp_path / "fleet.yaml").write_text(FLEET)
     y, y_m, u = topics
     with peer(topics=(u,)) as peer_node:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fleets over topics: in lockstep as lone flights.
+"""Test fleets over topics: in lockstep they fly as single flights.
 
-In real time no aircraft has an effect on another.
+In real time no aircraft affects another.
 """
 
 import re

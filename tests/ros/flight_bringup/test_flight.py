@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The end of a flight over topics: by Ctrl-C, with its command, with one of its nodes."""
+"""Test how a flight over topics ends: by Ctrl-C, with its command, or with one of its nodes."""
 
 import os
 import pty
@@ -32,23 +32,23 @@ Engaged = tuple[Process, list[psutil.Process]]
 
 @pytest.fixture
 def engaged(start: Start, tmp_path: Path) -> Engaged:
-    """A flight whose controller has engaged, and its four processes."""
+    """Return a flight whose controller has engaged, and its four processes."""
     flight = start(*FLY)
     flight.until(lambda: is_engaged(tmp_path), "a flight that has engaged")
     return flight, flight.children()
 
 
 def is_engaged(folder: Path) -> bool:
-    """Whether the controller of a flight below a folder has engaged."""
+    """Return whether the controller of a flight below a folder has engaged."""
     return any("ENGAGED" in log.read_text() for log in folder.glob("runs/*/log/controller.log"))
 
 
 def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
     start: Start, engaged: Engaged, tmp_path: Path
 ) -> None:
-    """The first by one interrupt, the one beside it by three.
+    """One interrupt ends the first flight, and three end the second.
 
-    The further ones do not interrupt its shutdown.
+    The later interrupts do not disturb its shutdown.
     """
     flight, nodes = engaged
     assert len(nodes) == 4

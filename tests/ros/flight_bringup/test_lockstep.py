@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lockstep over real DDS: repeatable to the byte.
+"""Test lockstep over real DDS, which is repeatable to the byte.
 
-It is equal to the loop in one process, and free of deadlocks.
+It is equal to the loop in one process, and has no deadlocks.
 """
 
 import json
@@ -59,14 +59,14 @@ AT_200_HZ: dict[str, dict[str, Any]] = {
 def scenario_file(
     folder: Path, duration: float, name: str = "osprey_servo", **sections: Mapping[str, Any]
 ) -> Path:
-    """A shortened scenario with changes to its sections."""
+    """Return a shortened scenario with changed sections."""
     return recordings.scenario_file(
         folder / "rough.yaml", find_scenario(name).path, flight={"duration": duration}, **sections
     )
 
 
 def fly(start: Start, scenario: Path, runs: str, *options: str, status: int = 0) -> Path:
-    """Fly to the end; return the folder of the run."""
+    """Fly to the end, and return the folder of the run."""
     command = start(
         "flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", str(runs), *options
     )
@@ -75,7 +75,7 @@ def fly(start: Start, scenario: Path, runs: str, *options: str, status: int = 0)
 
 
 def payloads(run: Path) -> dict[str, list[bytes]]:
-    """The bytes of every message by topic, in the order of sending, by mcap's own reader."""
+    """Return the bytes of every message by topic, in the order of sending, by mcap's own reader."""
     by_topic: dict[str, list[tuple[int, bytes]]] = {}
     with min(run.glob("*.mcap")).open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages():
@@ -95,7 +95,7 @@ def both_cores_busy() -> Iterator[None]:
 
 
 def with_limits(path: Path) -> Path:
-    """The scenario with feedforward, and with magnitude and rate limits at which u saturates."""
+    """Return the scenario with feedforward, and with limits at which u saturates."""
     controller = with_feedforward(load_scenario(path).controller, load_airframe("osprey"))
     limits = {"lower": [-0.05] * 4, "upper": [0.01] * 4, "slew": [0.3] * 4}
     as_json = json.loads(json.dumps(nest(dict(flatten(controller.model_dump())))))
@@ -141,7 +141,7 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
 
 
 def nodes(start: Start, scenario: Path, run: str) -> dict[str, Process]:
-    """The four nodes, started one by one as a user does, in an endless lockstep flight."""
+    """Start the four nodes one by one, as a user does, in a lockstep flight without an end."""
     overrides = {
         "recorder": (
             "flight_recorder",

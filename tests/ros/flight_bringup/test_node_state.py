@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The topic `node_state`: readiness and completion of nodes.
+"""Test the topic `node_state`, which says when a node is ready or has completed.
 
 Late subscribers and the process runner read it.
 """
@@ -21,7 +21,7 @@ from flight_ros.topics import NODE_STATE, START, STATE, STATES
 
 
 def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, str]:
-    """The newest state by process, filled while the peer spins."""
+    """Return the newest state by process, which is updated while the peer spins."""
     states: dict[str, str] = {}
     peer_node.node.create_subscription(
         KeyValue, topic, lambda message: states.update({message.key: message.value}), STATES
@@ -34,7 +34,7 @@ def test_state_of_each_process_for_late_subscriber_and_monitor_and_aircraft_that
 ) -> None:
     """The aircraft is matched with the publisher of u before t = 0.
 
-    Its y have stamps from t = 0 on.
+    Its first y has the stamp of t = 0.
     """
     in_namespace = ("-r", "__ns:=/one")
     nodes = {

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each node alone: a start that fails, waiting for a publisher, clean shutdown."""
+"""Test each node alone: a failed start, waiting for a publisher, and a clean shutdown."""
 
 import os
 import re
@@ -30,7 +30,7 @@ NODES = {
 
 
 def test_node_that_cannot_start_ends_with_status_2_and_one_sentence(start: Start) -> None:
-    """tests/nodes/flight_ros/test_node_parameters.py has the sentences of single parameters."""
+    """tests/nodes/flight_ros/test_node_parameters.py tests the sentences on single parameters."""
     no_profile = ("env", "FASTRTPS_DEFAULT_PROFILES_FILE=/nowhere/profile.xml")
     nodes = {
         "failed to initialize rcl: Couldn't parse params file": start(
@@ -101,7 +101,7 @@ def test_start_has_early_participant_and_late_replies_leave_controller_ticks(
 ) -> None:
     """The middleware blocks for 0.1 s before a reply whose reader does not match.
 
-    Here the reader requires another durability.
+    The reader here requires another durability.
     """
     stopped = start_node("rise_di_controller")
     early_participant = f"_start_{stopped.popen.pid}"

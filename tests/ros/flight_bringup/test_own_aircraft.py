@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The shells of docs/ros.md that start single nodes run as they stand.
+"""Test that the shells of docs/ros.md that start single nodes run as they stand.
 
-Each is a shell of its own, to its last command.
+Each is a separate shell, and runs to its last command.
 """
 
 import re
@@ -28,9 +28,9 @@ FIRST_CHUNKS = 100_000  # bytes of a log; the readers need a whole chunk
 
 
 def shells(section: str) -> tuple[list[str], list[str]]:
-    """The lines of a section that each shell begins with, and the commands.
+    """Return the lines with which each shell of a section begins, and the commands.
 
-    Each command has a shell of its own.
+    Each command has its own shell.
     """
     text = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     text = re.sub(r"^```python\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
@@ -41,9 +41,9 @@ def shells(section: str) -> tuple[list[str], list[str]]:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """A folder with what the commands of a page need of a checkout.
+    """Return a folder with what the commands of a page need from a checkout.
 
-    It has the programs of the page too.
+    It also has the programs of the page.
     """
     for name in (".venv", "ros_ws"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
@@ -55,7 +55,7 @@ def checkout(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def shell(checkout: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """The processes of a page; those that still run at the end of the test are killed."""
+    """Yield the processes of a page. Those that still run at the end of the test are killed."""
     processes: list[subprocess.Popen[bytes]] = []
     yield processes
     for process in processes:
@@ -74,7 +74,7 @@ def shell(checkout: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
 def test_shells_of_page_run_to_the_last_command(
     section: str, replaced: str, checkout: Path, shell: list[subprocess.Popen[bytes]]
 ) -> None:
-    """In place of the command `replaced` runs that of the section on a reference model."""
+    """The section's command for a reference model replaces the command `replaced`."""
     common, commands = shells(section)
     if replaced:
         _, (own,) = shells("Your own reference model")

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch file of docs/ros.md around nodes of one's own, by the official launch.
+"""Test the launch file of docs/ros.md with nodes of the user, by the official launch.
 
-launch and launch_ros are not on PyPI: .ci/ros has them.
+launch and launch_ros are not on PyPI. .ci/ros has them.
 """
 
 import os

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The access control policy allows exactly the topics and services that the nodes have."""
+"""Test that the access control policy allows exactly the topics and services of the nodes."""
 
 import json
 import time
@@ -32,7 +32,7 @@ POLICY = (
 
 
 class Access(NamedTuple):
-    """Names in full."""
+    """Full names."""
 
     publish: frozenset[str]
     subscribe: frozenset[str]
@@ -40,20 +40,20 @@ class Access(NamedTuple):
     request: frozenset[str]
 
     def merged(self, other: "Access") -> "Access":
-        """The union of both."""
+        """Return the union of both."""
         return Access(*(names | more for names, more in zip(self, other, strict=True)))
 
 
 def in_full(name: str, node: str) -> str:
-    """The full name, resolved as in the policy format.
+    """Return the full name, resolved as in the policy format.
 
-    "~" is the node's name; the namespace is the root.
+    "~" is the node's name, and the namespace is the root.
     """
     return f"/{node}/{name[1:]}" if name.startswith("~") else f"/{name.removeprefix('/')}"
 
 
 def allowed() -> dict[str, Access]:
-    """What the policy allows each node, by node name."""
+    """Return what the policy allows each node, by node name."""
     accesses = {}
     for enclave in ElementTree.parse(POLICY).getroot().findall("enclaves/enclave"):
         profiles = enclave.findall("profiles/profile")
@@ -72,16 +72,16 @@ def allowed() -> dict[str, Access]:
 
 
 def graph(peer_node: Peer, node: str) -> Access:
-    """The topics and services of a node in the ROS graph."""
+    """Return the topics and services of a node in the ROS graph."""
     kinds = ("publisher", "subscriber", "service", "client")
     find = [getattr(peer_node.node, f"get_{kind}_names_and_types_by_node") for kind in kinds]
     return Access(*(frozenset(name for name, _ in names(node, "/")) for names in find))
 
 
 def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
-    """The topics and services of the nodes, once the discovery has settled.
+    """Return the topics and services of the nodes after the discovery has settled.
 
-    Its endpoints are discovered one by one.
+    Endpoints are discovered one by one.
     """
     accesses: dict[str, Access] = {}
     changed_at = time.monotonic()
@@ -109,7 +109,7 @@ FURTHER = {"guidance": (GUIDANCE, "osprey_route"), "learner": (LEARNER, "osprey_
 
 
 def start_further(start: Start, run: Path, *, lockstep: bool) -> list[Process]:
-    """Start the nodes that few scenarios have, and the bridge in a flight in real time."""
+    """Start the nodes that few scenarios have, and the bridge for a flight in real time."""
     processes = []
     for spec, name in FURTHER.values():
         scenario = find_scenario(name)
@@ -136,7 +136,7 @@ def start_further(start: Start, run: Path, *, lockstep: bool) -> list[Process]:
 def test_policy_allows_exactly_topics_and_services_of_nodes(
     start: Start, start_node: Start, osprey_gust: Scenario, tmp_path: Path, peer_node: Peer
 ) -> None:
-    """In a flight in real time with a learner and a probe, and in one in lockstep without."""
+    """One flight is in real time with a learner and a probe, and one in lockstep without them."""
     policy = allowed()
     learning = str(find_scenario("osprey_learn").path)
     processes = [
@@ -185,7 +185,7 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(
 
 
 def check_bridge(own: Access, policy: Access) -> None:
-    """Check the policy of the bridge: what it has with one map, and what the other maps add."""
+    """Check the bridge's policy: what it needs for one map, and what the other maps add."""
     rows = [row for name in MAP_FILES for row in named_map(name).used_topics()]
     sent_topics, received_topics = (
         [row for row in rows if row[0].startswith("messages.") is is_sent]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight over topics in real time: its log, and its accuracy beside a flight in one process."""
+"""Test a flight over topics in real time: its log, and its accuracy against one process."""
 
 import json
 import os
@@ -27,7 +27,7 @@ DURATION = 8.0
 
 @pytest.fixture
 def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
-    """The default scenario with a command on each channel and both gusts within 8 s."""
+    """Return the default scenario with a command on each channel and both gusts within 8 s."""
     text = osprey_gust.path.read_text()
     for old, new in (
         ("duration: 60.0", f"duration: {DURATION}"),

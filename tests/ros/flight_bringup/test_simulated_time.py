@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The example simulator with its own /clock over real DDS.
+"""Test the example simulator with its own /clock over real DDS.
 
-Slow, fast and in lockstep the aircraft tracks alike.
+The aircraft tracks equally well when it is slow, fast and in lockstep.
 """
 
 import shutil
@@ -27,12 +27,12 @@ IN_LOCKSTEP = ("-p", "lockstep:=true")
 
 
 def pitch_rate(message: JointState | None) -> float:
-    """Q of a named vector, rad/s; 0 before the first."""
+    """Return q of a named vector, rad/s, or 0 before the first."""
     return 0.0 if message is None else float(message.position[message.name.index("q")])
 
 
 def error(run: Path) -> float:
-    """The rms of the error of q from the first command on, rad/s.
+    """Return the rms of the error of q from the first command on, rad/s.
 
     The ticks of the flight are computed again to the bit.
     """
@@ -126,7 +126,10 @@ def test_nodes_begin_again_with_a_new_simulation(
 
 @pytest.mark.parametrize("ends", [False, True], ids=["whole", "simulator ends"])
 def test_fly_is_by_the_clock_of_a_simulator(ends: bool, start: Start, tmp_path: Path) -> None:
-    """Two seconds of flight in one of the host; without the simulator the flight is over."""
+    """Two seconds of flight take one second of the host.
+
+    Without the simulator the flight ends.
+    """
     shutil.copy(REPOSITORY / "examples" / "simulator" / "simulator.py", tmp_path)
     apart = ("--ros-args", "-r", "y:=/apart/y", "-r", "u:=/apart/u")
     simulator = start("simulator", "2", *apart)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""rise-di play: subscribers get every byte of a recorded flight in time.
+"""Test rise-di play: subscribers get every byte of a recorded flight in time.
 
-A controller reproduces its u.
+A controller computes the same u again.
 """
 
 import time
@@ -30,9 +30,9 @@ MS = 1_000_000
 
 
 class Receiver:
-    """Subscribes to topics.
+    """A subscriber to topics.
 
-    Holds the bytes of their messages and the instants at which they were sent.
+    It has the bytes of their messages, and when they were sent.
     """
 
     def __init__(self, node: Node, *topics: Topic) -> None:
@@ -108,7 +108,7 @@ def test_flight_played_byte_by_byte_with_timing_and_clock_and_in_a_loop(
 def test_topics_that_cannot_be_sent_are_skipped_and_those_with_a_publisher_refused(
     start: Start, tmp_path: Path, domain: int, peer_node: Peer
 ) -> None:
-    """A type that is not installed, a name that no topic of ROS may have, and JSON, beside a y."""
+    """The log has a type that is not installed, a name that ROS does not allow, JSON, and y."""
     y = serialize_message(to_message(1, ("q",), np.zeros(1), "peer"))
     log = tmp_path / "mixed.mcap"
     with log.open("wb") as stream:
@@ -146,7 +146,10 @@ def test_topics_that_cannot_be_sent_are_skipped_and_those_with_a_publisher_refus
 
 
 def contents(payloads: list[bytes]) -> list[tuple[int, list[str], bytes]]:
-    """Stamps, names and the bytes of the values. A log of one process names no publisher."""
+    """Return stamps, names and the bytes of the values.
+
+    A log of one process names no publisher.
+    """
     messages = [deserialize_message(payload, JointState) for payload in payloads]
     return [(stamp_ns(each), each.name, each.position.tobytes()) for each in messages]
 

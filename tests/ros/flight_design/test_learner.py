@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's node beside the controller: lockstep, proposals of others, and a restart."""
+"""Test the learner's node and the controller: lockstep, foreign proposals, and a restart."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from rise_di_controller.learning.proposals import Event, EventKind
 
 
 def scenario(folder: Path, **learn: object) -> Scenario:
-    """osprey_learn at 100 Hz, with the aircraft of the file."""
+    """Return osprey_learn at 100 Hz, with the aircraft of the file."""
     learning = find_scenario("osprey_learn").vary(
         flight={"duration": 11.0},
         aircraft={"rate": 100.0, "step": 0.005, "uncertainty": {"A": 0.0, "B": 0.0}},
@@ -36,9 +36,9 @@ def scenario(folder: Path, **learn: object) -> Scenario:
 def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(
     tmp_path: Path,
 ) -> None:
-    """An aircraft off by 30 %: a fallback, then a model.
+    """The aircraft is off by 30 %, and the flight has a fallback and then a model.
 
-    It ends at the tick that waits for the second proposal, and that begins the third search.
+    It ends at the tick that waits for the second proposal, and in which the third search begins.
     """
     guided = scenario(tmp_path, updates=[10.0, 10.5]).vary(
         flight={"duration": 10.5},

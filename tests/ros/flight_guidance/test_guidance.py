@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance over topics: lockstep as in one process, and the commands and the page that fly it."""
+"""Test guidance over topics: lockstep, and the commands and the page that control it."""
 
 import json
 import math
@@ -54,9 +54,9 @@ def test_lockstep_flight_repeats_bytes_of_one_process(start: Start, tmp_path: Pa
 
 
 def tools_read(run: Path, logged: Signal) -> None:
-    """Rosbags reads what tools get as guidance had it.
+    """Check with Rosbags that tools get what guidance had.
 
-    SciPy has the frames of REP 103, pymap3d the place on WGS84.
+    SciPy converts the frames of REP 103, and pymap3d the place on WGS84.
     """
     with AnyReader([run]) as reader:
         messages: dict[str, list[Any]] = {
@@ -121,12 +121,12 @@ def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(
 
 @pytest.fixture
 def calm(tmp_path: Path) -> Path:
-    """The osprey in calm air, without a route."""
+    """Return the osprey in calm air, without a route."""
     return in_calm_air(tmp_path / "calm.yaml")
 
 
 class Flight:
-    """A guidance node alone; the peer is aircraft and controller."""
+    """A guidance node. The peer plays the aircraft and the controller."""
 
     def __init__(self, start: Start, peer_node: Peer, scenario: Path) -> None:
         self.peer = peer_node
@@ -136,7 +136,7 @@ class Flight:
         self.rng = np.random.default_rng(1)
 
     def send(self) -> None:
-        """One y, one pose and one sample of internals, stamped now."""
+        """Send a y, a pose and a sample of internals with the present stamp."""
         now_ns = time.time_ns()
         pose = np.array([LEVEL.get(name, 0.0) for name in POSE])
         # a pose that stands still is refused
@@ -151,18 +151,18 @@ class Flight:
         )
 
     def until(self, condition: Callable[[], object], because: str) -> None:
-        """Send until the condition holds."""
+        """Send until the condition is true."""
         self.peer.until(condition, because, each=self.send)
 
     def last(self, name: str) -> float:
-        """The last value of a channel of `guidance`; NaN before the first."""
+        """Return the last value of a channel of `guidance`, or NaN before the first."""
         message = self.peer.last("guidance")
         return math.nan if message is None else float(message.position[message.name.index(name)])
 
 
 @pytest.fixture
 def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
-    """Guidance that has engaged."""
+    """Return guidance that has engaged."""
     flight_over_topics = Flight(start, peer_node, calm)
     flight_over_topics.until(lambda: peer_node.received["u_m"], "a u_m")
     return flight_over_topics

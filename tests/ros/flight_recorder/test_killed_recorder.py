@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A recorder that is killed: how much of the log is lost, and its repair."""
+"""Test a recorder that is killed: how much of the log is lost, and its repair."""
 
 import json
 import signal
@@ -33,7 +33,10 @@ SIGNALS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
 
 def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]:
-    """Stamps and sequences in the file of a recorder, running or not, by topic."""
+    """Return stamps and sequences in the file of a recorder by topic.
+
+    The recorder may still run.
+    """
     by_topic: dict[str, tuple[list[int], list[int]]] = {}
     for topic, record in logged(folder):
         if topic in SIGNALS:
@@ -44,10 +47,10 @@ def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]
 
 
 def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
-    """Delay of a recorder's file behind the messages that another process received, s.
+    """Return how far a recorder's file is behind the messages of another process, s.
 
-    It is that of the topic with the largest delay. The messages are taken first: the publishers
-    go on while the file is read, and what they send meanwhile is not the recorder's loss.
+    The result is the largest delay of a topic. The messages are taken first, because the publishers
+    continue while the file is read, and what they send then is not lost.
     """
     received = [stamp_of(message.message) for message in witness.take()]
     by_topic = stamps_and_sequences(folder)
@@ -57,7 +60,7 @@ def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
 
 
 def is_up_to_date(folder: Path, witness: PolledSubscription) -> bool:
-    """Whether the file is at most 0.2 s behind."""
+    """Return whether the file is at most 0.2 s behind."""
     return missing_seconds(folder, witness) <= 0.2
 
 

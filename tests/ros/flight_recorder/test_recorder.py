@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder over DDS.
+"""Test the recorder over DDS.
 
-Topics of ROS 2 itself, any offered quality of service, lost messages, and a forged packet.
-tests/nodes/flight_recorder/test_recorder.py has what it does with its messages.
+The tests cover topics of ROS 2 itself, any offered quality of service, lost messages, and a forged
+packet. tests/nodes/flight_recorder/test_recorder.py tests what it does with its messages.
 """
 
 import re
@@ -36,7 +36,7 @@ PEER_TOPICS = ("/diagnostics",)
 
 
 def diagnostics(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
-    """Level, sentence and figures of the recorder's newest diagnostics."""
+    """Return level, sentence and figures of the recorder's newest diagnostics."""
     for status in (message.status[0] for message in reversed(peer_node.received["/diagnostics"])):
         if status.name == "/recorder":
             return (
@@ -160,8 +160,8 @@ def test_plain_publishers_of_any_rate_are_recorded(
 def forge_gap(domain: int, writer: bytes) -> None:
     """Send a GAP of a writer to all participants of this host.
 
-    Its readers take 100,000 samples as irrelevant. DDSI-RTPS 2.3: header 8.3.3, GAP 9.4.5.5 with
-    the sequence numbers from 1 on, ports 9.6.1.1.
+    Its readers then take 100,000 samples as irrelevant. DDSI-RTPS 2.3: header 8.3.3, GAP 9.4.5.5
+    with the sequence numbers from 1 on, ports 9.6.1.1.
     """
     # the first, the base of the set, and an empty set
     numbers = struct.pack("<iIiII", 0, 1, 0, 100_000, 0)
@@ -177,7 +177,7 @@ def forge_gap(domain: int, writer: bytes) -> None:
 def test_forged_end_of_topic_named(
     recorder: Recorder, peer_node: Peer, domain: int, tmp_path: Path, host_delays: HostDelays
 ) -> None:
-    """One packet ends the recording of a topic for good, while its publisher goes on."""
+    """One packet ends the recording of a topic for ever, while its publisher continues."""
     process = recorder("run").wait_for("ready")
 
     def send() -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of other nodes: what a node says of a clock that differs."""
+"""Test the clocks of other nodes: what a node says about a clock that differs."""
 
 import re
 import struct
@@ -17,7 +17,7 @@ from flight_ros.topics import DIAGNOSTICS
 
 
 def test_refusal_names_clock_of_the_other_node(start_node: Start, tmp_path: Path) -> None:
-    """The clock of the aircraft is 0.15 s behind, more than `max_age` of the controller, 0.1 s."""
+    """The aircraft's clock is 0.15 s behind, and `max_age` of the controller is 0.1 s."""
     (step := tmp_path / "step").write_bytes(struct.pack("=q", -150 * NANOSECONDS // 1000))
     shifted = ("env", f"LD_PRELOAD={settable_clock(tmp_path)}", f"FAULTS_CLOCK={step}")
     controller = start_node("rise_di_controller")

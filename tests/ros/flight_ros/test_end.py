@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A node that is told to end ends, with its exit status, also where the middleware blocks."""
+"""Test that a node ends with its exit status when it is told to, even if the middleware blocks."""
 
 import signal
 from collections.abc import Callable

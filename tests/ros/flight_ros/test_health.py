@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Health check of the containers: a running node passes, a suspended and a missing node fail."""
+"""Test the health check of the containers, which fails for a suspended or missing node."""
 
 import subprocess
 import sys

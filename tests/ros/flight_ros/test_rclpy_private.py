@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the stack takes from inside rclpy does what the public interface beside it does."""
+"""Test that the private parts of rclpy in use do the same as its public interface."""
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks from this host and from another host: reception of y, forged u, transport."""
+"""Test attacks from this host and from another: reception of y, forged u, transport."""
 
 import json
 import shutil
@@ -44,7 +44,7 @@ ON_LOOPBACK = environment(
 
 
 def received(attacker: Process) -> int:
-    """Number of samples of y that the attacker received until its end."""
+    """Return how many samples of y the attacker received until its end."""
     attacker.succeed()
     return int(json.loads(attacker.lines[-1])["received"])
 
@@ -68,7 +68,7 @@ class Hosts(NamedTuple):
 
 
 def is_separate(holder: subprocess.Popen[bytes]) -> bool:
-    """Whether the process has left this network namespace, or has ended."""
+    """Return whether the process has left this network namespace, or has ended."""
     own_namespace = Path("/proc/self/ns/net")
     holder_namespace = Path(f"/proc/{holder.pid}/ns/net")
     return holder.poll() is not None or holder_namespace.readlink() != own_namespace.readlink()
@@ -80,7 +80,7 @@ def is_up(show_link: list[str]) -> bool:
 
 @pytest.fixture
 def hosts() -> Iterator[Hosts]:
-    """Two hosts on one network. Skipped without the permission to create them."""
+    """Yield two hosts on one network. The test is skipped without the permission to create them."""
     unshare, nsenter, ip = (shutil.which(command) or "" for command in ("unshare", "nsenter", "ip"))
     if not (unshare and nsenter and ip):
         pytest.skip("no unshare, nsenter (util-linux) or ip (iproute2) here")
@@ -133,7 +133,7 @@ OPEN_PROFILE = """<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_P
 
 @pytest.fixture
 def on_network(tmp_path: Path) -> tuple[str, ...]:
-    """The environment of a process with network transport."""
+    """Return the environment of a process with network transport."""
     profile = tmp_path / "open.xml"
     profile.write_text(OPEN_PROFILE)
     discovery = {
@@ -146,9 +146,9 @@ def on_network(tmp_path: Path) -> tuple[str, ...]:
 def test_second_host_has_access_by_network_profile_alone(
     start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
-    """Without the profile the host neither receives y nor commands u.
+    """Without the profile, the second host neither receives y nor commands u.
 
-    With it each of two hosts says so of the other.
+    With it, each host reports the other one.
     """
     node = aircraft(start_node, within=hosts.first)
     assert (

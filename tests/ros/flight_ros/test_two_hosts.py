@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An aircraft and its controller on two hosts.
+"""Test an aircraft and its controller on two hosts.
 
-The hosts are network namespaces, with a network of delay and loss between them.
+The hosts are network namespaces, and the network between them has a delay and a loss.
 """
 
 import re
@@ -32,9 +32,9 @@ REPORTS = 3  # of the aircraft, one a second
 def test_age_of_u_is_right_and_pulled_cable_ends_in_failsafe(
     start: Start, start_node: Start, tmp_path: Path
 ) -> None:
-    """The age as the aircraft tells it, by its clock alone, is the measured one.
+    """The aircraft computes the age of u with its own clock alone, and the measured age is equal.
 
-    A node beside it without code of the stack measures.
+    A node without code of the stack measures it.
     """
     unshare, nsenter, ip = (shutil.which(command) or "" for command in ("unshare", "nsenter", "ip"))
     if not (unshare and nsenter and ip and Path("/dev/net/tun").exists()):

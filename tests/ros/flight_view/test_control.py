@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control of a real flight over the page's server.
+"""Test the control of a real flight over the page's server.
 
-Gains, faults, a gust, the controller; in the log, and replayed.
+Gains, faults, a gust and the controller are changed, are in the log, and are replayed.
 """
 
 import json
@@ -29,7 +29,7 @@ PEER_TOPICS = ("truth",)
 
 
 class Page:
-    """Posts requests as a page does."""
+    """A page that posts requests."""
 
     def __init__(self, address: str, key: str) -> None:
         self._base, _, token = address.partition("#token=")
@@ -61,11 +61,11 @@ class Page:
             return None if error.code == HTTPStatus.TOO_MANY_REQUESTS else answer
 
     def until(self, flight: Process, **expected: Any) -> dict[str, Any]:
-        """Ask for the state until it has these values."""
+        """Request the state until it has these values."""
         return self._until(flight, lambda found: found | expected == found)
 
     def until_flown(self, flight: Process) -> dict[str, Any]:
-        """Ask for the state until the log has the digest that the page knows of the controller."""
+        """Request the state until the log has the controller's digest that the page knows."""
         return self._until(
             flight, lambda found: "digest" in found and found["digest"] == found["logged"]
         )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight under test: processes that can be killed and stopped, and a probe.
+"""Provide a flight under test: processes that can be killed and stopped, and a probe.
 
 The probe receives and times their messages.
 """
@@ -147,7 +147,7 @@ class Received(NamedTuple):
 
 
 class Probe:
-    """Receives the flight's topics in a thread of its own.
+    """A receiver of the flight's topics in its own thread.
 
     `until` waits for a condition on them.
     """
@@ -210,7 +210,7 @@ class Probe:
         self.delays.append((time.time(), longest / NANOSECONDS))
 
     def since(self, topic: str, begin: float, end: float = float("inf")) -> list[Received]:
-        """The messages of a topic from one instant to another."""
+        """Return the messages of a topic between two instants."""
         messages: list[Received] = []
         with self._changed:
             for arrival in reversed(self.received[topic]):
@@ -221,7 +221,7 @@ class Probe:
         return messages[::-1]
 
     def until(self, condition: Callable[[], Any], timeout: float, what: str) -> Any:
-        """Wait until the condition holds of the received messages; its value."""
+        """Wait until the condition on the received messages is true, and return its value."""
 
         def change() -> None:
             with self._changed:
@@ -230,7 +230,7 @@ class Probe:
         return until(condition, what, change, timeout)
 
     def target(self, **values: float) -> None:
-        """Command guidance, by channel."""
+        """Command guidance by channel."""
         self._target.publish(
             to_message(time.time_ns(), [*values], np.array([*values.values()]), "/probe")
         )
@@ -253,7 +253,7 @@ def _waited_ns(process: int) -> int:
 
 
 def _scheduled_ns(path: Path) -> tuple[int, int]:
-    """How long a thread ran, and how long it was ready and waited for a processor, ns.
+    """Return how long a thread ran, and how long it was ready and waited for a processor, ns.
 
     Source: proc_pid_schedstat.
     """
@@ -273,7 +273,7 @@ class Ticks(NamedTuple):
 
     @property
     def modes(self) -> list[Mode]:
-        """The modes in their order, without repetitions."""
+        """Return the modes in their order, without repetitions."""
         return [
             Mode(int(mode))
             for k, mode in enumerate(self.mode)
@@ -287,15 +287,15 @@ def _ticks(t: FloatArray, values: FloatArray) -> Ticks:
 
 
 def tick_channels(inputs: tuple[str, ...]) -> tuple[str, ...]:
-    """The channels of `internals` in the order of `Ticks`."""
+    """Return the channels of `internals` in the order of `Ticks`."""
     groups = (("e", OUTPUTS), ("u", inputs), ("y", OUTPUTS), ("y_m", OUTPUTS))
     return ("mode", *(f"{group}.{name}" for group, names in groups for name in names))
 
 
 def steady_scenario(source: Path, folder: Path) -> Path:
-    """A scenario in a steady flight 0.1 m/s above trim, without an end.
+    """Return a scenario in a steady flight 0.1 m/s above trim, without an end.
 
-    U is not 0, so that a change of it shows. Guidance, where the scenario has a section of it,
+    u is not 0, so that a change of it shows. If the scenario has a section for guidance, guidance
     commands this flight with level wings.
     """
     tree = yaml.safe_load(source.read_text())
@@ -332,9 +332,9 @@ RELEASE_AFTER = 3.0  # s without a message: RC_OVERRIDE_TIME of ArduPilot
 
 
 def fast_map(folder: Path) -> Path:
-    """The map of the simulated autopilot with 200 messages a second.
+    """Return the map of the simulated autopilot with 200 messages per second.
 
-    An observer's loop with a small delay needs them.
+    The loop of an observer with a small delay needs them.
     """
     content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text())
     content["messages"]["joy"]["rate"] = 200.0
@@ -344,7 +344,7 @@ def fast_map(folder: Path) -> Path:
 
 
 class ExpectedLog(NamedTuple):
-    """What the log must hold of the time of a fault."""
+    """What the log must have from the time of a fault."""
 
     internals: set[bytes]  # of the flight's own controllers, except `last`
     # node and log line, except those right before the end of a killed node
@@ -354,7 +354,7 @@ class ExpectedLog(NamedTuple):
 
 
 class Killed(NamedTuple):
-    """A killed node: it still ran at one instant, and no longer at another, s."""
+    """A killed node, which still ran at one instant and no longer at another, s."""
 
     role: str
     instance: str
@@ -431,7 +431,7 @@ class Flight:
         return process
 
     def _run(self, *words: str, cwd: Path, stdin: int | None = None) -> Process:
-        """Start a process of the flight, which lasts until its end."""
+        """Start a process of the flight, which lasts until the flight ends."""
         process = self._starter.submit(
             Process, *words, cwd=cwd, within=OWN_SESSION, stdin=stdin
         ).result()
@@ -440,7 +440,7 @@ class Flight:
 
     @contextmanager
     def pose_fault(self, word: str) -> Iterator[None]:
-        """A fault of the relayed pose during the block."""
+        """Cause a fault of the relayed pose during the block."""
         assert self.gate is not None
         stdin = self.gate.popen.stdin
         assert stdin is not None
@@ -449,12 +449,12 @@ class Flight:
         print("pass", file=stdin, flush=True)
 
     def set_clock(self, by: float) -> None:
-        """Set the system clock of the processes this far from the true one, s."""
+        """Set the system clock of the processes to this offset from the true one, s."""
         with self._step.open("r+b") as stream:
             stream.write(struct.pack("=q", nanoseconds(by)))
 
     def start(self, role: str, *parameters: str) -> float:
-        """Start one of the roles; the instant of the start."""
+        """Start one of the roles, and return the instant of the start."""
         if role == "recorder" and not parameters:
             self.runs.append(self.folder / f"run{len(self.runs)}")
             parameters = (f"directory:={self.runs[-1]}", "min_free:=0.0")
@@ -464,22 +464,22 @@ class Flight:
         return at
 
     def spent(self, role: str) -> tuple[float, float]:
-        """Processor time of the main thread of a role's process, and the time that it waited, s.
+        """Return the processor time of a process's main thread, and how long it waited, s.
 
-        It waits where it is ready and has no processor.
+        It waits while it is ready and has no processor.
         """
         run, waited = _scheduled_ns(Path(f"/proc/{self.processes[role].popen.pid}/schedstat"))
         return seconds(run), seconds(waited)
 
     def kill(self, role: str) -> None:
-        """SIGKILL."""
+        """Kill a node, as SIGKILL does."""
         alive = time.time()
         self.processes[role].popen.kill()
         assert self.processes[role].end() == -signal.SIGKILL
         self._killed.append(Killed(role, self.instance(role), alive, time.time()))
 
     def instance(self, role: str) -> str:
-        """The `frame_id` of the messages of a role's present process."""
+        """Return the `frame_id` of the messages of a role's present process."""
         return f"/{role}#{self.processes[role].popen.pid}"
 
     def close(self) -> None:
@@ -497,9 +497,9 @@ class Flight:
         self.probe.close()
 
     def engage(self) -> None:
-        """Engage through the bridge, as soon as it permits.
+        """Engage through the bridge as soon as it permits this.
 
-        The end of the fault is the last request.
+        The fault ends with the last request.
         """
 
         def requested() -> bool:
@@ -514,24 +514,24 @@ class Flight:
     # The fault
 
     def begin_fault(self) -> float:
-        """Mark the beginning of the fault: a case calls this right before it."""
+        """Mark the beginning of the fault. A case calls this immediately before it."""
         self.begin = self.end = time.time()
         return self.begin
 
     def end_fault(self) -> None:
-        """Mark the end of the fault: a case calls this right after it."""
+        """Mark the end of the fault. A case calls this immediately after it."""
         self.end = time.time()
 
     # Received messages
 
     def ticks(self, begin: float, end: float = float("inf")) -> Ticks:
-        """The controller's ticks."""
+        """Return the controller's ticks."""
         return _ticks(*self._values("internals", self._tick_channels, begin, end))
 
     def foreign_y(self, begin: float, end: float) -> list[StampedVector]:
-        """The engaged ticks with the y of another publisher.
+        """Return the engaged ticks with the y of another publisher.
 
-        Their stamp, that of y, is none of the aircraft's instants.
+        Their stamp, which is the stamp of y, is none of the aircraft's instants.
         """
         (instant, *_) = (sample.stamp_ns for _, sample in self._samples("truth", (), begin, end))
         ticks = [
@@ -542,9 +542,9 @@ class Flight:
         return [tick for tick in ticks if (tick.stamp_ns - instant) % period_ns(RATE, "rate")]
 
     def engaged_ticks(self, begin: float, until: float) -> Ticks | None:
-        """The engaged ticks with samples from `begin` on, from the log, which is complete.
+        """Return the engaged ticks with samples from `begin` on, from the log, which is complete.
 
-        None before the log reaches `until`.
+        Before the log reaches `until`, this is None.
         """
         decoder = Decoder(self._tick_channels)
         tables = []
@@ -563,11 +563,11 @@ class Flight:
     def actuator_positions(
         self, begin: float, end: float = float("inf")
     ) -> tuple[FloatArray, FloatArray]:
-        """The applied inputs of the aircraft: when (N,), and their deviations from trim (N, m)."""
+        """Return when the aircraft applied inputs, (N,), and their deviations from trim, (N, m)."""
         return self._values("truth", self._actuators, begin, end)
 
     def bank(self, begin: float, end: float = float("inf")) -> tuple[FloatArray, FloatArray]:
-        """The true bank of the aircraft in a guided flight: when (N,), and rad (N,)."""
+        """Return the true bank of the aircraft in a guided flight: when (N,), and rad (N,)."""
         t, phi = self._values(TRUE_POSE.name, ("phi",), begin, end)
         return t, phi[:, 0]
 
@@ -582,31 +582,31 @@ class Flight:
     def _samples(
         self, topic: str, names: tuple[str, ...], begin: float, end: float
     ) -> Iterator[tuple[float, StampedVector]]:
-        """The samples of the flight's own nodes, and when they were received."""
+        """Yield the samples of the flight's own nodes, and when they were received."""
         decoder = Decoder(names)
         for arrival in self.probe.since(topic, begin, end):
             if (sample := self._decode(decoder, arrival.message)) is not None:
                 yield arrival.at, sample
 
     def _decode(self, decoder: Decoder, data: bytes) -> StampedVector | None:
-        """A message of the flight's own nodes; None for any other."""
+        """Return a message of the flight's own nodes, or None for any other message."""
         sample = decoder.decode(data)
         return sample if sample is not None and sample.sender in self._instances else None
 
     def pause(self, topic: str, begin: float, end: float) -> float:
-        """The longest time without a message between two instants, s."""
+        """Return the longest time without a message between two instants, s."""
         times = [begin, *(arrival.at for arrival in self.probe.since(topic, begin, end)), end]
         return float(np.diff(times).max())
 
     def host_delay(self, begin: float, end: float) -> float:
-        """The longest host scheduling delay of a process between two instants, s.
+        """Return the longest scheduling delay of a process between two instants, s.
 
-        The process was ready, and waited for a processor. As Linux counts it (proc_pid_schedstat),
-        for all threads of a process together. It is at least the time without a sample of it, in
-        which the probe itself waited. It is also at least the time without a message of any node.
-        The nodes are processes of their own: all pause at once where the host of a virtual machine
-        withholds its processors, which Linux in that machine does not count, or where the
-        middleware of the probe waits.
+        In this time the process was ready and waited for a processor, as Linux counts it
+        (proc_pid_schedstat) for all threads together. The result is at least the time in which the
+        probe had no sample of this count, because the probe itself waited then. It is also at least
+        the time without a message from any node. The nodes are separate processes. All of them
+        pause at once if the host of a virtual machine withholds its processors, which Linux in this
+        machine does not count, or if the middleware of the probe waits.
         """
         end += 2.0 * DELAY_PERIOD
         samples = [
@@ -623,25 +623,25 @@ class Flight:
         return float(max([0.0, *gaps, *silences, *(delay for at, delay in samples if at >= begin)]))
 
     def waited(self, begin: float, end: float) -> float:
-        """At most so long did a process wait for a processor between two instants, s.
+        """Return how long a process waited for a processor at most between two instants, s.
 
-        All its delays count together.
+        All its delays are added.
         """
         return sum(
             delay for at, delay in list(self.probe.delays) if begin <= at <= end + DELAY_PERIOD
         )
 
     def first_line(self, role: str, pattern: str, begin: float) -> float | None:
-        """When a node first logged a line that matches the pattern."""
+        """Return when a node first logged a line that matches the pattern."""
         for arrival in self.probe.since("/rosout", begin):
             if arrival.message.name == role and re.search(pattern, arrival.message.msg):
                 return arrival.at
         return None
 
     def expect_in_log(self, case: str) -> None:
-        """Keep what was received since the fault's begin.
+        """Keep what was received since the beginning of the fault.
 
-        The end of a killed node counts from HISTORY before it on.
+        For a killed node, messages from the time HISTORY before its end are kept.
         """
         decoder = Decoder(())
         killed_nodes = [
@@ -697,7 +697,7 @@ class Flight:
         self.expected_logs[case] = ExpectedLog(internals.difference(*last), logged_lines, last)
 
     def diagnostics(self, role: str, begin: float) -> list[tuple[float, str, dict[str, str]]]:
-        """The 1 Hz diagnostics of a node: when received, the instance, and the values by key."""
+        """Return the diagnostics of a node: when received, the instance, and the values by key."""
         return [
             (
                 arrival.at,
@@ -710,9 +710,9 @@ class Flight:
         ]
 
     def count(self, role: str, key: str) -> float:
-        """The last value of a counter in the diagnostics of a role's present process.
+        """Return the last value of a counter in the diagnostics of a role's present process.
 
-        0 where it has none.
+        If there is none, it is 0.
         """
         instance = self.instance(role)
         reports = [
@@ -721,7 +721,7 @@ class Flight:
         return float(reports[-1].get(key, 0.0)) if reports else 0.0
 
     def first_message(self, topic: str, begin: float, instance: str = "") -> float | None:
-        """When the first message of a topic was received, of any publisher or of one instance."""
+        """Return when the first message of a topic was received, from any publisher or from one."""
         sender = f"{instance}\0".encode() if instance else b""
         return next(
             (arrival.at for arrival in self.probe.since(topic, begin) if sender in arrival.message),
@@ -729,7 +729,7 @@ class Flight:
         )
 
     def engaged_since(self, begin: float) -> float | None:
-        """Since when the law has been engaged without a break until now; None where it is not."""
+        """Return since when the law has been engaged without a break, or None if it is not."""
         ticks = self.ticks(begin)
         if not len(ticks.t) or ticks.mode[-1] != Mode.ENGAGED:
             return None
@@ -739,9 +739,9 @@ class Flight:
         return float(ticks.t[breaks.max() + 1] if len(breaks) else ticks.t[0])
 
     def is_steady(self) -> bool:
-        """Whether the law has been engaged and has tracked for 0.4 s.
+        """Return whether the law has been engaged and has tracked for 0.4 s.
 
-        The aircraft applies its u.
+        The aircraft must apply its u.
         """
         now = time.time()
         ticks, (_, inputs) = self.ticks(now - 0.4), self.actuator_positions(now - 0.1)
@@ -759,17 +759,17 @@ class Flight:
         )
 
     def is_level(self) -> bool:
-        """Whether a guided flight has had level wings for half a second."""
+        """Return whether a guided flight has had level wings for half a second."""
         t, phi = self.bank(time.time() - 0.5)
         return bool(len(t) and np.abs(phi).max() <= LEVEL)
 
     def is_at_rest(self) -> bool:
-        """Whether u has hardly moved in the last second."""
+        """Return whether u has hardly moved in the last second."""
         u = self.ticks(time.time() - 1.0).u
         return bool(len(u) and np.ptp(u, axis=0).max() <= 0.03)
 
     def is_near_trim(self) -> bool:
-        """Whether no input has been far from trim in the last half second."""
+        """Return whether no input has been far from trim in the last half second."""
         begin = time.time() - 0.5
         inputs = (
             self.ticks(begin).u if self.kind is Kind.BRIDGED else self.actuator_positions(begin)[1]
@@ -777,7 +777,7 @@ class Flight:
         return bool(len(inputs) and np.abs(inputs).max() <= 0.2)
 
     def until_steady(self, timeout: float = 60.0) -> None:
-        """Wait until the flight is steady, as without a fault."""
+        """Wait until the flight is steady, as it is without a fault."""
         begin = time.time()
         try:
             self.until(self.is_steady, timeout, "engaged and tracking again")

@@ -55,7 +55,7 @@ REPORT_PERIOD = 10.0  # s, of the lines that report missing subscribers
 
 @contextmanager
 def matched_publisher(topic: str) -> Iterator[Publisher]:
-    """A publisher that all subscribers have discovered."""
+    """Yield a publisher that all subscribers have discovered."""
     transport.prepare()
     context = Context()
     rclpy.init(context=context)
@@ -115,7 +115,7 @@ FAULTS = ("pass", "repeat", "freeze", "jump", "hold")
 
 
 def gate(source: str, target: str) -> None:
-    """Relay a named vector, with the fault that was named last."""
+    """Relay a named vector with the fault that was named last."""
     transport.prepare()
     rclpy.init()
     node = Node("gate")
@@ -154,9 +154,9 @@ def gate(source: str, target: str) -> None:
 
 
 def clients(address: str, count: int, duration: float) -> None:
-    """So many connections to a page, within `duration` s or longer.
+    """Open `count` connections to a page within `duration` s or longer.
 
-    The server closes all beyond its limit. Each sends its requests for all samples as fast as the
+    The server closes all beyond its limit. Each sends requests for all samples as fast as the
     server reads them, and reads no answer.
     """
     parts = urlsplit(address)

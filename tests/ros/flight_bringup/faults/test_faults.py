@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each fault is detected in time, and has no other effect on u than the failsafe.
+"""Test that each fault is detected in time, and changes u only by the failsafe.
 
-After recovery no effect is left.
+After the recovery no effect remains.
 """
 
 import math
@@ -70,9 +70,9 @@ def test_fault_is_detected_contained_and_recovered_from(
 def test_random_faults_detected_contained_and_recovered_from(
     flights: Flights, draws: Sequence[Draw], record: Callable[[Row], None]
 ) -> None:
-    """Of two at a time: each is detected by the node that should.
+    """If there are two faults at a time, each is detected by the right node.
 
-    No process ends, and the flight is steady again.
+    No process ends, and the flight becomes steady again.
     """
     failed = []
     for draw in draws:
@@ -96,7 +96,7 @@ def test_random_faults_detected_contained_and_recovered_from(
 
 
 def check_two(draw: Draw, views: Sequence[Flight]) -> None:
-    """Check what holds of a fault whatever the other one does."""
+    """Check what must be true of a fault, whatever the other one does."""
     for case, view in zip(draw.cases, views, strict=True):
         if case.detection is not None:
             view.until(
@@ -111,11 +111,11 @@ def check_two(draw: Draw, views: Sequence[Flight]) -> None:
 
 
 def test_log_holds_every_received_message_of_each_fault(flights: Flights) -> None:
-    """To the byte, also of a time without a recorder.
+    """The log is complete to the byte, also for a time without a recorder.
 
-    Publishers keep their last samples for the next one. Of a killed node, the last messages within
-    NOT_RETRANSMITTED may be missing from the log, because no process is left to retransmit them.
-    Those that are in the log are without a gap.
+    Publishers keep their last samples for the next recorder. The last messages of a killed node,
+    within NOT_RETRANSMITTED, may be missing, because no process is left to retransmit them. Those
+    that are in the log have no gap.
     """
     flights.close()
     for flight in flights.all:
@@ -129,7 +129,7 @@ def test_log_holds_every_received_message_of_each_fault(flights: Flights) -> Non
 
 
 def contents(runs: list[Path]) -> tuple[set[bytes], set[tuple[str, str]]]:
-    """All `internals` of some logs, and all log lines with their nodes."""
+    """Return all `internals` of some logs, and all log lines with their nodes."""
     internals = set()
     lines = set()
     for topic, record in (message for run in runs for message in logged(run)):
@@ -142,7 +142,7 @@ def contents(runs: list[Path]) -> tuple[set[bytes], set[tuple[str, str]]]:
 
 
 class Window(NamedTuple):
-    """The re-engagement after a fault, host scheduling delay, and the time allowed, s."""
+    """The re-engagement after a fault, the host's scheduling delay, and the allowed time, s."""
 
     engaged: float
     host_delay: float
@@ -152,7 +152,7 @@ class Window(NamedTuple):
 def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
     """Check all that the case states.
 
-    Returns the time of the detection, of the recovery, and the host scheduling delay, s.
+    Returns the time of the detection, of the recovery, and the scheduling delay of the host, s.
     """
     reaction = None
     if case.detection is not None:
@@ -186,22 +186,22 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
 
 
 def check_processes(flight: Flight) -> None:
-    """No process has ended or raised an exception."""
+    """Check that no process has ended or raised an exception."""
     for role, process in flight.processes.items():
         assert process.popen.poll() is None, f"{role} has ended: {process.output}"
         assert "Traceback" not in process.output
 
 
 def engaged_for(duration: float, flight: Flight) -> float | None:
-    """Since when the law has been engaged, once that has lasted for a duration after the fault."""
+    """Return since when the law has been engaged, once this is long enough after the fault."""
     since = flight.engaged_since(flight.begin)
     return since if since is not None and time.time() - max(since, flight.end) >= duration else None
 
 
 def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
-    """The law and the aircraft used samples of the flight's own nodes only.
+    """Check that the law and the aircraft only used samples of the flight's own nodes.
 
-    No topic paused beyond its age limit.
+    No topic may have paused beyond its age limit.
     """
     until = flight.end + SETTLING
     ticks, (_, applied) = (
@@ -238,7 +238,7 @@ def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
 def check_pauses(
     flight: Flight, topics: tuple[str, ...], end: float, window: Window, *, limited: bool = True
 ) -> dict[str, float]:
-    """No topic paused for longer than its age limit, where it is `limited`; the pauses, s."""
+    """Check that no topic that is `limited` paused beyond its age limit. Return the pauses, s."""
     pauses = {topic: flight.pause(topic, flight.begin, end) for topic in topics}
     limits = {
         topic: (U_MAX_AGE if topic == "u" else MAX_AGE) + 2.0 * window.host_delay
@@ -253,9 +253,9 @@ def check_pauses(
 
 
 def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> None:
-    """HOLD: u is constant to the last bit; RAMP: a straight line to trim; TRIM: 0.
+    """Check u in the failsafe: constant in HOLD, a straight line in RAMP, 0 in TRIM.
 
-    A bumpless re-engagement follows.
+    A bumpless re-engagement must follow.
     """
     ticks = flight.ticks(flight.begin, window.engaged + SETTLING)
     # the controller does not publish a new tick until y or y_m is stale: well within the aircraft's
@@ -288,9 +288,9 @@ def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> Non
 
 
 def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
-    """The aircraft holds its last input for the age limit and HOLD, then ramps it to trim.
+    """Check the failsafe of the aircraft: its last input, then a ramp to trim.
 
-    The next u is applied bumpless.
+    The input is held for the age limit and HOLD. The next u must be applied without a jump.
     """
     t, applied = flight.actuator_positions(flight.begin, window.engaged + SETTLING)
     before = flight.actuator_positions(flight.begin - 0.5, flight.begin + 0.05)[1][-1]
@@ -333,9 +333,9 @@ def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
 
 
 def check_late(case: Case, flight: Flight, window: Window) -> None:
-    """The law is engaged, or u is held where samples came too late.
+    """Check that the law is engaged, or that u is held if samples came too late.
 
-    U does not move more than in a steady flight.
+    u must not move more than in a steady flight.
     """
     ticks = flight.ticks(flight.begin, flight.end + SETTLING)
     assert set(ticks.modes) <= {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
@@ -344,9 +344,9 @@ def check_late(case: Case, flight: Flight, window: Window) -> None:
 
 
 def check_released(case: Case, flight: Flight, window: Window) -> None:
-    """While disengaged the controller is at trim and computes nothing.
+    """Check that a controller that is not engaged is at trim and computes nothing.
 
-    It begins at trim. y_m continues.
+    It must begin at trim, and y_m continues.
     """
     ticks = flight.ticks(flight.begin, window.engaged + SETTLING)
     disengaged = (ticks.t > flight.begin + case.within + window.slack) & (ticks.t < flight.end)
@@ -361,11 +361,11 @@ MAX_LEVEL_BANK = np.radians(5.0)
 
 
 def check_wings_levelled(case: Case, flight: Flight, window: Window) -> None:
-    """The law flies on; the bank stays bounded, and the wings are level when they have to be.
+    """Check that the law flies on, the bank stays bounded, and the wings are level in time.
 
-    The ending knows no bank but that by dead reckoning with y_m. While the host delays the
-    controller or the aircraft, the roll rate is not that of y_m; they differ by at most that of a
-    roll-in to one side from that to the other.
+    When guidance falls silent, the bank is only known by dead reckoning with y_m. While the host
+    delays the controller or the aircraft, the roll rate is not the one of y_m. They differ at most
+    by the change from a roll-in to one side to a roll-in to the other.
     """
     host_delay = flight.host_delay(flight.begin - 0.1, flight.begin + LEVEL)
     roll_rate = load_scenario(flight.scenario).reference_model.live.roll_rate
@@ -382,7 +382,7 @@ def check_wings_levelled(case: Case, flight: Flight, window: Window) -> None:
 
 
 def check_within_limits(case: Case, flight: Flight, window: Window) -> None:
-    """The law flies on; the bank stays within the limit of guidance and its overshoot."""
+    """Check that the law flies on, and that the bank stays within its limit and overshoot."""
     bank = np.abs(flight.bank(flight.begin)[1]).max()
     assert JUMP["phi"] / 2.0 <= bank <= MAX_GUIDED_BANK
     check_flies_on(flight, window)

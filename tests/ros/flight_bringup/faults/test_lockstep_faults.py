@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults of lockstep flights.
+"""Test lockstep flights with random faults.
 
 A killed node is named as the cause, and a stopped one changes no byte of the log.
-benchmarks/random_faults.py injects them; the tests of lockstep cover single cases.
+benchmarks/random_faults.py injects the faults, and the tests of lockstep cover single cases.
 """
 
 import json
@@ -79,7 +79,7 @@ def fly_with_a_fault(
     *,
     kills: bool,
 ) -> None:
-    """A lockstep flight with a fault at a random instant."""
+    """Fly in lockstep with a fault at a random instant."""
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", str(runs))
     folder = scenario.parent / runs
     # bytes: the flight has begun, and a chunk of the log is complete
@@ -100,7 +100,7 @@ def fly_with_a_fault(
 
 
 def stop(victim: psutil.Process, duration: float) -> None:
-    """SIGSTOP, then SIGCONT."""
+    """Stop a process with SIGSTOP, and continue it with SIGCONT."""
     victim.suspend()
     time.sleep(duration)  # the fault itself
     victim.resume()
