@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of one flight, as the recorders of ROS 2 and other programs leave them.
+"""Write bags of one flight as the recorders of ROS 2 and other programs do.
 
-Files that are no logs are beside them. The writers are the libraries mcap and rosbags, not the
+Files that are no logs are beside them. The writers are the libraries mcap and rosbags, and not the
 stack.
 """
 
@@ -47,7 +47,7 @@ CLOCK = struct.Struct("<iI")
 
 
 class Recorded(NamedTuple):
-    """A message as a recorder stores it; times in ns."""
+    """A message as a recorder stores it, with times in ns."""
 
     topic: str
     log_ns: int
@@ -56,14 +56,14 @@ class Recorded(NamedTuple):
 
 
 def restamped(data: bytes, stamp_ns: int) -> bytes:
-    """A message with another stamp in the header."""
+    """Return a message with another stamp in its header."""
     return data[:4] + CLOCK.pack(*divmod(stamp_ns, NANOSECONDS)) + data[12:]
 
 
 def flight_messages(file: Path) -> list[Recorded]:
-    """The messages of a log in the order of recording, with stamps of today.
+    """Return the messages of a log in the order of recording, with stamps of today.
 
-    Received 1 ms and sent 0.5 ms later.
+    They are sent 0.5 ms and received 1 ms after their stamps.
     """
     with file.open("rb") as stream:
         stored = [
@@ -83,7 +83,7 @@ def flight_messages(file: Path) -> list[Recorded]:
 def write_metadata(
     folder: Path, names: Sequence[str], messages: Sequence[Recorded], **information: object
 ) -> None:
-    """Write metadata.yaml of rosbag2 that names these files."""
+    """Write metadata.yaml of rosbag2 with these files."""
     first, last = (choose((m.log_ns for m in messages), default=0) for choose in (min, max))
     topics = dict.fromkeys(message.topic for message in messages)
     content = {
@@ -124,7 +124,7 @@ def write_mcap(
     profile: str = "ros2",
     **options: Any,
 ) -> Path:
-    """Write the messages as an MCAP file, by the library mcap with its options."""
+    """Write the messages as an MCAP file with the library mcap and its options."""
     folder.mkdir(parents=True, exist_ok=True)
     text = STORE.generate_msgdef(JOINT_STATE, ros_version=2)[0].encode()
     with (folder / name).open("wb") as stream:
@@ -151,7 +151,7 @@ def write_rosbags(
     mode: CompressionMode | None,
     storage: StoragePlugin = StoragePlugin.MCAP,
 ) -> None:
-    """Write the messages by the library rosbags."""
+    """Write the messages with the library rosbags."""
     writer = RosbagWriter(folder, version=9, storage_plugin=storage)
     if mode is not None:
         writer.set_compression(mode, CompressionFormat.ZSTD)
@@ -165,13 +165,13 @@ def write_rosbags(
 
 
 def parts(messages: Sequence[Recorded]) -> list[Sequence[Recorded]]:
-    """The messages in three parts."""
+    """Return the messages in three parts."""
     third = len(messages) // 3
     return [messages[:third], messages[third : 2 * third], messages[2 * third :]]
 
 
 def in_namespace(namespace: str, messages: Sequence[Recorded]) -> list[Recorded]:
-    """The messages of a flight in a namespace."""
+    """Return the messages of a flight in a namespace."""
     return [message._replace(topic=f"{namespace}{message.topic}") for message in messages]
 
 
@@ -198,7 +198,10 @@ def packed(
     pack: Callable[[bytes], bytes],
     part: float = 1.0,
 ) -> None:
-    """Write an MCAP file and pack it; `part` is the part of the packed file that is left."""
+    """Write an MCAP file and pack it.
+
+    `part` is the fraction of the packed file that is kept.
+    """
     plain = write_mcap(folder, messages, chunk_size=1 << 14)
     content = pack(plain.read_bytes())
     plain.with_name(plain.name + suffix).write_bytes(content[: int(len(content) * part)])
@@ -208,7 +211,7 @@ def packed(
 def split(
     folder: Path, messages: Sequence[Recorded], names: Sequence[str], *, metadata: bool = True
 ) -> None:
-    """Write the messages in three files; a name "" leaves a file out.
+    """Write the messages in three files, without those whose name is "".
 
     metadata.yaml names bag_0 to bag_2.
     """
@@ -221,7 +224,7 @@ def split(
 
 
 def whole_bags() -> dict[str, Callable[[Path, list[Recorded]], object]]:
-    """Writers of bags that hold the whole flight, by name."""
+    """Return writers of bags with the whole flight, by name."""
     text = STORE.generate_msgdef(JOINT_STATE, ros_version=2)[0].encode()
     nothing: dict[str, Any] = {
         "use_chunking": False,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium, controlled over its DevTools pipe.
+"""Control a headless Chromium over its DevTools pipe.
 
 The pipe carries JSON that ends with a zero byte, on descriptors 3 and 4.
 """
@@ -29,9 +29,9 @@ CONSOLE_EVENTS = {"Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.en
 
 
 class Browser:
-    """One browser with one page.
+    """A browser with one page.
 
-    `console` holds the exceptions and console messages of the last page that was opened.
+    `console` has the exceptions and console messages of the page that was opened last.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Browser:
             os.close(end)
 
     def call(self, method: str, **params: Any) -> Any:
-        """The result of a command of the DevTools protocol.
+        """Return the result of a command of the DevTools protocol.
 
         Raises RuntimeError with the error of the browser.
         """
@@ -106,12 +106,15 @@ class Browser:
         return dict(json.loads(message))
 
     def open(self, page: Path | str) -> None:
-        """Open a page from a file, or by its address."""
+        """Open a page from a file, or from an address."""
         self._events.clear()
         self.call("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
 
     def run(self, expression: str) -> Any:
-        """The value of a JavaScript expression, awaited. Raises RuntimeError with its exception."""
+        """Return the value of a JavaScript expression, awaited.
+
+        Raises RuntimeError with its exception.
+        """
         result = self.call(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )
@@ -122,8 +125,8 @@ class Browser:
     def wait_for(self, expression: str, limit: float = 120.0) -> None:
         """Wait until an expression is true. Raises TimeoutError after `limit` seconds.
 
-        Time counts while the browser answers: of each look at most LOOK, since other work may keep
-        the processor from both.
+        Only time in which the browser answers is counted, at most LOOK for each look, because other
+        work may keep the processor from both.
         """
         waited = 0.0
         before = time.monotonic()
@@ -136,7 +139,10 @@ class Browser:
             before = now
 
     def _holds(self, expression: str) -> bool:
-        """Whether an expression is true; not on a page that the browser is leaving."""
+        """Return whether an expression is true.
+
+        On a page that the browser is leaving, it is not.
+        """
         try:
             return bool(self.run(expression))
         except RuntimeError as error:
@@ -146,11 +152,11 @@ class Browser:
 
     @property
     def pid(self) -> int:
-        """The process of the browser."""
+        """Return the process id of the browser."""
         return self._process.pid
 
     @property
     def console(self) -> list[dict[str, Any]]:
-        """Exceptions, console messages and log entries of the page."""
+        """Return exceptions, console messages and log entries of the page."""
         self.run("0")  # earlier events arrive before this result
         return [event["params"] for event in self._events if event.get("method") in CONSOLE_EVENTS]

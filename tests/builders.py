@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builders that several tests share.
+"""Provide what several tests build.
 
-Parameters and truth of the simulated aircraft, errors of a flight.
+This is parameters and truth of the simulated aircraft, and errors of a flight.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ MS = 1_000_000  # ns
 
 
 def aircraft_parameters(**values: Any) -> AircraftConfig:
-    """The osprey at 100 Hz with steps of 2 ms, with these values instead or in addition."""
+    """Return the osprey at 100 Hz with steps of 2 ms, and with other or further values."""
     return AircraftConfig.validate_mapping(
         {"airframe": "osprey", "rate": 100.0, "step": 0.002} | values, "aircraft"
     )
@@ -31,7 +31,7 @@ def truth_of(simulator: Simulator) -> dict[str, float]:
 
 
 def rms(tape: Tape) -> FloatArray:
-    """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
+    """Return the rms of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
     e = error(tape)
     return np.array(
         [

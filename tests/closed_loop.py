@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builders that the tests of the closed loop share.
+"""Provide what the tests of the closed loop build.
 
-They make parameters of the law, reference outputs, and flights without a scenario.
+This is parameters of the law, reference outputs, and flights without a scenario.
 """
 
 import math
@@ -50,7 +50,7 @@ ms."""
 def calm_osprey(
     duration: float, wind: tuple[float, float] = (0.0, 0.0), **guidance: Any
 ) -> Scenario:
-    """The osprey of osprey_route in a steady wind without noise.
+    """Return the osprey of osprey_route in a steady wind without noise.
 
     Its steps are larger than the scenario's, and a section of guidance replaces the route.
     """
@@ -69,7 +69,7 @@ def calm_osprey(
 
 
 def in_calm_air(path: Path, **guidance: object) -> Path:
-    """A file of the osprey in calm air, without a route."""
+    """Write a file of the osprey in calm air, without a route."""
     varied = find_scenario("osprey_route").vary(
         aircraft={"wind": [0.0, 0.0], "turbulence": None}, guidance={"route": None} | guidance
     )
@@ -80,9 +80,9 @@ def in_calm_air(path: Path, **guidance: object) -> Path:
 def law_params(
     K: Any, Lambda: Any, beta: Any, D: Any = 1.0, sign: Sign = Sign.IMPLICIT, **others: Any
 ) -> LawParams:
-    """Parameters of the law.
+    """Return parameters of the law.
 
-    A number holds for each channel; input_scale, omega and eps are 1 by default.
+    A number applies to each channel. By default input_scale, omega and eps are 1.
     """
     values = {"K": np.atleast_1d(K), "Lambda": Lambda, "beta": beta, "D": D}
     values |= {"input_scale": 1.0, "omega": 1.0, "eps": 1.0} | others
@@ -95,7 +95,7 @@ def law_params(
 
 
 def still_air(A: FloatArray, B: FloatArray, C: FloatArray, gravity: FloatArray) -> Aircraft:
-    """An aircraft without gusts."""
+    """Return an aircraft without gusts."""
     empty = np.zeros(0)
     return Aircraft(
         A=A,
@@ -111,7 +111,7 @@ def still_air(A: FloatArray, B: FloatArray, C: FloatArray, gravity: FloatArray) 
 def reference_outputs(
     params: model.ReferenceMatrices, profile: Profile, dt: float, steps: int
 ) -> FloatArray:
-    """y_m at 0, dt, 2 dt, ..., shape (steps + 1, m), from rest."""
+    """Return y_m at 0, dt, 2 dt, ..., (steps + 1, m), from rest."""
     x_m = np.zeros(len(params.A_m))
     matrices = model.stepper(dt, params)
     y_m = [model.output(x_m, params)]
@@ -131,11 +131,10 @@ def fly(
     bound: float,
     x_0: FloatArray | None = None,
 ) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m).
+    """Return the errors e at 0, dt, 2 dt, ..., (ticks, m).
 
-    An error above the bound ends the flight.
-
-    The law acts on the aircraft through ideal actuators. The flight starts from x_0, or from trim.
+    An error above the bound ends the flight. The law acts on the aircraft through ideal actuators.
+    The flight starts from x_0, or from trim.
     """
     period_ns = nanoseconds(dt)
     m = len(law.K)
@@ -156,7 +155,7 @@ def fly(
 
 
 def error(tape: Tape) -> Signal:
-    """The true error of a simulated flight."""
+    """Return the true error of a simulated flight."""
     signal = true_error(tape)
     assert signal is not None
     return signal

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures of all tests: the default scenario and the log of a flight."""
+"""Provide the fixtures of all tests: the default scenario and the log of a flight."""
 
 import asyncio
 import gc
@@ -49,7 +49,11 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="session", autouse=True)
 def _empty_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Reports, exports and campaigns show the guarantees that the user computed: here none."""
+    """Use an empty cache.
+
+    Reports, exports and campaigns show the guarantees that a user has computed, and here there are
+    none.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -57,7 +61,7 @@ def _empty_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What a test computes is kept in a folder of its own, which few tests need: none is made."""
+    """Give each test a cache folder of its own. It is not created until a test needs it."""
     before = os.environ["XDG_CACHE_HOME"]
     folder = tmp_path_factory.getbasetemp() / f"caches-{next(_NUMBERS)}"
     os.environ["XDG_CACHE_HOME"] = str(folder)
@@ -66,7 +70,7 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def refusing(sentence: str) -> AbstractContextManager[pytest.ExceptionInfo[ParameterError]]:
-    """Expect a ParameterError whose sentence has a match of the pattern."""
+    """Expect a ParameterError whose sentence matches the pattern."""
     return pytest.raises(ParameterError, match=sentence)
 
 
@@ -92,10 +96,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Leave what is imported and collected out of each collection of garbage.
+    """Keep imported and collected objects out of the collection of garbage.
 
-    It stays until the end, half a million objects: to visit them took a quarter of the processor
-    time of the tests.
+    There are half a million of them, and they stay until the end. Visiting them took a quarter of
+    the processor time of the tests.
     """
     gc.disable()
     try:
@@ -117,7 +121,10 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort the quick tests to the end: no worker computes long after the others have ended."""
+    """Sort the quick tests to the end.
+
+    So no worker computes long after the others have ended.
+    """
     items.sort(
         key=lambda item: "pure" in item.path.parts and item.get_closest_marker("slow") is None
     )
@@ -125,19 +132,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def osprey_gust() -> Scenario:
-    """The default scenario."""
+    """Return the default scenario."""
     return find_scenario("osprey_gust")
 
 
 @pytest.fixture(scope="session")
 def tape(osprey_gust: Scenario) -> Tape:
-    """Two seconds of the default scenario in one process."""
+    """Return two seconds of the default scenario in one process."""
     return simulate(osprey_gust.vary(flight={"duration": 2.0}))
 
 
 @pytest.fixture(scope="session")
 def flight(osprey_gust: Scenario) -> RecordedFlight:
-    """Three seconds of the default scenario, as a report reads them."""
+    """Return three seconds of the default scenario, as a report reads them."""
     scenario = osprey_gust.vary(flight={"duration": 3.0})
     tape = simulate(scenario)
     return RecordedFlight("run", scenario, tape, summarise(tape, scenario))
@@ -145,7 +152,7 @@ def flight(osprey_gust: Scenario) -> RecordedFlight:
 
 @pytest.fixture(scope="session")
 def recorded(tape: Tape, osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log of `tape` with the attachments of a flight."""
+    """Return the log of `tape` with the attachments of a flight."""
     folder = tmp_path_factory.mktemp("recorded") / "run"
     folder.mkdir()
     write_run(tape, folder, attachments_for(osprey_gust.vary(flight={"duration": 2.0}), folder))
@@ -154,14 +161,14 @@ def recorded(tape: Tape, osprey_gust: Scenario, tmp_path_factory: pytest.TempPat
 
 @pytest.fixture
 def run(recorded: Path, tmp_path: Path) -> Path:
-    """A copy of `recorded` to damage."""
+    """Return a copy of `recorded` that may be damaged."""
     return Path(shutil.copytree(recorded, tmp_path / "run"))
 
 
 def with_policy(*policy: str) -> list[str]:
-    """A function that runs a command with a scheduling policy, as options of chrt.
+    """Return a function that runs a command with a scheduling policy, given as options of chrt.
 
-    Skips the test where that is not permitted.
+    The test is skipped if this is not permitted.
     """
     command = [shutil.which("chrt") or "", *policy]
     if (

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Damages to a topic of a log: samples that are missing, and stamps of a clock that was set."""
+"""Damage a topic of a log: samples are missing, or stamps are of a clock that was set."""
 
 import struct
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ Damage = Callable[[int, int, bytes], bytes | None]
 
 
 def restamped(data: bytes, stamp_ns: int) -> bytes:
-    """A message with another stamp."""
+    """Return a message with another stamp."""
     stamp = struct.pack("<iI", *divmod(stamp_ns, NANOSECONDS))
     return data[: STAMP.start] + stamp + data[STAMP.stop :]
 
@@ -52,9 +52,9 @@ DAMAGES: Mapping[str, Damage] = {
 
 
 def damage(log: Path, copy: Path, topic: str, change: Damage, *, from_ns: int = 0) -> Path:
-    """Write the copy of a log with a damaged topic; an empty `topic` damages each.
+    """Write a copy of a log with a damaged topic. An empty `topic` damages all topics.
 
-    The stamps count from `from_ns`.
+    The stamps are counted from `from_ns`.
     """
     copy.parent.mkdir(parents=True, exist_ok=True)
     with log.open("rb") as source, copy.open("wb") as target:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of an independent publisher, serialised without ROS."""
+"""Serialise messages of an independent publisher without ROS."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -25,7 +25,7 @@ def vector(
     sender: str = "",
     **more: Sequence[float],
 ) -> bytes:
-    """A JointState of these channels; `velocity` and `effort` may be given."""
+    """Return a JointState of these channels. `velocity` and `effort` may be given."""
     types: dict[str, Any] = STORE.types
     stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
     header = types["std_msgs/msg/Header"](stamp, sender)
@@ -37,7 +37,7 @@ def vector(
 
 
 def path(*points: tuple[float, float, float], frame: str = "map") -> bytes:
-    """A Path through points (north, east, altitude), without a stamp."""
+    """Return a Path through points (north, east, altitude), without a stamp."""
     types: dict[str, Any] = STORE.types
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), frame)
     level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
@@ -56,9 +56,9 @@ def parameter_event(
     deleted: Mapping[str, object] = NONE,
     stamp_ns: int = 0,
 ) -> bytes:
-    """The ParameterEvent of a node.
+    """Return the ParameterEvent of a node.
 
-    It has parameters that have changed, are new, or have no value any more (None).
+    Its parameters have changed, are new, or have no value any more (None).
     """
     types: dict[str, Any] = STORE.types
     kinds = {

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: D101, D102 - launch documents its classes and methods
-"""Stand-in for the parts of `launch` and `launch_ros` that the launch files use. It runs nothing.
+"""Stand in for the parts of `launch` and `launch_ros` that the launch files use.
 
-Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy); any other
-argument is a TypeError. .ci/ros launches a flight with the official packages.
+It runs nothing. Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy),
+and any other argument is a TypeError. .ci/ros launches a flight with the official packages.
 """
 
 import os
@@ -41,9 +41,9 @@ class LaunchContext:
         self.events.append(event)
 
     def handle(self, actions: Sequence[Any]) -> list[Any]:
-        """The actions that follow from the kept events, given all actions so far.
+        """Return the actions that follow from the kept events, given all actions so far.
 
-        Unregisters handlers that handle once.
+        Handlers that handle once are unregistered.
         """
         follow: list[Any] = []
         events = self.events
@@ -69,20 +69,20 @@ class RosNode:
     def create_subscription(
         self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any
     ) -> None:
-        """Keep the callback by the topic."""
+        """Keep the callback with its topic."""
         self.subscriptions[topic] = callback
 
     def create_publisher(self, kind: type, topic: str, qos: Any) -> Any:
-        """A publisher that keeps the messages with the topic."""
+        """Return a publisher that keeps the messages with the topic."""
         return SimpleNamespace(publish=lambda message: self.published.append((topic, message)))
 
     def resolve_topic_name(self, topic: str) -> str:
-        """A full name, which is itself."""
+        """Return a full name as it is."""
         assert topic.startswith("/")
         return topic
 
     def count_publishers(self, topic: str) -> int:
-        """The publishers of other processes."""
+        """Return the number of publishers of other processes."""
         return self.publishers.get(topic, 0)
 
     def create_timer(self, period: float, callback: Callable[[], None]) -> None:
@@ -90,20 +90,20 @@ class RosNode:
 
 
 def get_ros_node(context: LaunchContext) -> RosNode:
-    """The node. It needs the transport profile in the environment."""
+    """Return the node. The environment must have the transport profile."""
     assert PROFILE_VARIABLE in os.environ
     return context.ros_node
 
 
 def prefix_namespace(base_ns: str | None, ns: str | None) -> str | None:
-    """`ns` below `base_ns`, unless `ns` is absolute."""
+    """Return `ns` below `base_ns`, unless `ns` is absolute."""
     if ns is None or not base_ns:
         return base_ns if ns is None else ns
     return ns if ns.startswith("/") else f"{base_ns.rstrip('/')}/{ns}".rstrip("/")
 
 
 def make_namespace_absolute(ns: str | None) -> str | None:
-    """`ns` with a slash in front."""
+    """Return `ns` with a slash in front."""
     return ns if ns is None or ns.startswith("/") else f"/{ns}"
 
 
@@ -119,7 +119,7 @@ class LaunchConfiguration:
     variable_name: str
 
     def perform(self, context: LaunchContext) -> str:
-        """The value."""
+        """Return the value."""
         return context.launch_configurations[self.variable_name]
 
 
@@ -168,7 +168,7 @@ class TimerAction(Action):
     is_canceled: bool = False
 
     def cancel(self) -> None:
-        """Call nothing any more."""
+        """Do not call any more."""
         self.is_canceled = True
 
 
@@ -242,7 +242,7 @@ MODULES: dict[str, tuple[Any, ...]] = {
 
 
 def modules() -> dict[str, ModuleType]:
-    """The modules by their names."""
+    """Return the modules by name."""
     stand_ins = {name: ModuleType(name) for name in MODULES}
     for name, members in MODULES.items():
         for member in members:

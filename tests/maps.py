@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channel maps by name: the library of the bridge, and examples/maps."""
+"""Provide channel maps by name, from the library of the bridge and from examples/maps."""
 
 from pathlib import Path
 
@@ -15,5 +15,5 @@ MAP_FILES: dict[str, Path] = {
 
 
 def named_map(name: str) -> ChannelMap:
-    """The map of a name, from the library or from the examples."""
+    """Return the map with a name, from the library or from the examples."""
     return load_map(str(MAP_FILES[name]))

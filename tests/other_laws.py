@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sections `controller` of osprey_servo under other laws.
+"""Provide sections `controller` of osprey_servo with other laws.
 
-They are those of docs/laws.md, and that of the example package.
+They are those of docs/laws.md and of the example package.
 """
 
 import os
@@ -47,9 +47,9 @@ if OWN_LAW:
 
 @contextmanager
 def example_installed(folder: Path) -> Iterator[None]:
-    """The example as an installed package.
+    """Install the example as a package.
 
-    It has its modules, and the metadata with its entry point in a folder.
+    The folder has its modules, and the metadata with its entry point.
     """
     metadata = folder / "pid_law-0.1.0.dist-info"
     metadata.mkdir()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a report as the Python library plotly reads them.
+"""Read the figures of a report as the Python library plotly does.
 
 It refuses names and values that plotly.js does not know.
 """
@@ -11,6 +11,6 @@ from flight_analysis.report.plotting import Figure
 
 
 def drawn(figure: Figure | None) -> go.Figure:
-    """The figure, which is there."""
+    """Return the figure, which must exist."""
     assert figure is not None
     return go.Figure(figure.data, figure.layout)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fields of the message types that the channel maps use, as their packages publish them.
+"""Provide the fields of the message types that the channel maps use, as published.
 
-common_interfaces lacks these types. Only the fields that a map uses, from the definitions of the
-releases below. tests/nodes/autopilot_bridge/test_published_messages.py compares them with the
-installed packages.
+common_interfaces lacks these types. There are only the fields that a map uses, from the definitions
+of the releases below. tests/nodes/autopilot_bridge/test_published_messages.py compares them with
+the installed packages.
 """
 
 import re
@@ -76,9 +76,9 @@ def kind(field: str) -> Kind:
 
 
 def blank(type_name: str) -> SimpleNamespace:
-    """An object with the published fields at zero, as rclpy creates them.
+    """Return an object with the published fields at zero, as rclpy creates them.
 
-    Arrays are of NumPy with the type of the field.
+    Arrays are NumPy arrays with the type of the field.
     """
     message = SimpleNamespace()
     for name, field in PUBLISHED[type_name].items():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builders that the tests of logs and reports share: signals, scenario files, damaged logs."""
+"""Provide signals, scenario files and damaged logs for the tests of logs and reports."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ EPOCH = 1_795_000_000_000_000_000
 
 
 def signal(stamps_ms: Sequence[float], **channels: ArrayLike) -> Signal:
-    """Channels by stamps in ms after EPOCH. A number holds at all stamps."""
+    """Return channels with stamps in ms after EPOCH. A number applies to all stamps."""
     stamps = EPOCH + np.array([round(stamp * MS) for stamp in stamps_ms], dtype=np.int64)
     values = [
         np.broadcast_to(np.asarray(channel, dtype=float), stamps.shape)
@@ -32,7 +32,7 @@ def signal(stamps_ms: Sequence[float], **channels: ArrayLike) -> Signal:
 
 
 def scenario_file(path: Path, base: Path, **sections: Mapping[str, Any]) -> Path:
-    """Write a scenario file with changes to the sections of another."""
+    """Write a scenario file with changes to the sections of another one."""
     tree = yaml.safe_load(base.read_text())
     for name, changes in sections.items():
         tree[f"/**/{name}"]["ros__parameters"] |= changes
@@ -43,7 +43,7 @@ def scenario_file(path: Path, base: Path, **sections: Mapping[str, Any]) -> Path
 def truncate(run: Path, fraction: float) -> bytes:
     """Leave what a killed recorder leaves.
 
-    The beginning of the file, which is returned, and no metadata.yaml.
+    This is the beginning of the file, which is returned, without metadata.yaml.
     """
     file = run / "run_0.mcap"
     content = file.read_bytes()
@@ -54,7 +54,7 @@ def truncate(run: Path, fraction: float) -> bytes:
 
 
 def summary_of(file: Path) -> Summary:
-    """The summary section of an MCAP file, as the library mcap reads it."""
+    """Return the summary section of an MCAP file, as the library mcap reads it."""
     with file.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
@@ -62,7 +62,7 @@ def summary_of(file: Path) -> Summary:
 
 
 def messages(run: Path) -> list[tuple[str, int, bytes]]:
-    """Topic, log time and bytes of all messages, as rosbags reads them.
+    """Return topic, log time and bytes of all messages, as rosbags reads them.
 
     Each can be deserialised.
     """
@@ -77,7 +77,7 @@ def messages(run: Path) -> list[tuple[str, int, bytes]]:
 
 
 def count_messages(run: Path) -> Counter[str]:
-    """The number of messages in a log, by topic."""
+    """Return the number of messages in a log, by topic."""
     return Counter(topic for topic, _, _ in messages(run))
 
 

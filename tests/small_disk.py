@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A small file system for tests of a full disk; skipped without the permission to mount it."""
+"""Mount a small file system for tests of a full disk. They are skipped without the permission."""
 
 import errno
 import os
@@ -17,7 +17,7 @@ from flight_log.disk import free_bytes
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """A file system of `size` bytes, mounted on a new folder."""
+    """Mount a file system of `size` bytes on a new folder."""
     mount, unmount = (shutil.which(command) for command in ("mount", "umount"))
     folder.mkdir()
     command = [str(mount), "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]

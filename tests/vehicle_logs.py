@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writers of the logs of autopilots, by the published formats."""
+"""Write the logs of autopilots, by the published formats."""
 
 import struct
 from collections.abc import Mapping, Sequence
@@ -24,9 +24,9 @@ def write_dataflash(
     firmware: str,
     changes: Changes = (),
 ) -> None:
-    """A DataFlash log: every field a float.
+    """Write a DataFlash log in which every field is a float.
 
-    Messages are in the order of their stamps, firmware and parameters before them.
+    Messages are in the order of their stamps, after the firmware and the parameters.
     """
 
     def format_of(identity: int, size: int, name: bytes, types: bytes, labels: bytes) -> None:
@@ -62,10 +62,10 @@ def write_ulog(
     changes: Changes = (),
     second: Mapping[str, Rows] = MappingProxyType({}),
 ) -> None:
-    """A ULog of topics by name.
+    """Write a ULog with topics by name.
 
-    The fields are as PX4 declares them, all float (PX4 guide, ULog file format). `second` has the
-    samples of the instance 1 by topic.
+    The fields are as PX4 declares them, and all are float (PX4 guide, ULog file format). `second`
+    has the samples of the instance 1 by topic.
     """
 
     def message(kind: bytes, content: bytes) -> bytes:
@@ -107,7 +107,7 @@ def write_ulog(
 
 
 def write_tlog(path: Path, messages: Sequence[tuple[int, Any]], system: int = 1) -> None:
-    """A tlog: before each packet its time, us since 1970 (MAVLink guide).
+    """Write a tlog, with the time before each packet, us since 1970 (MAVLink guide).
 
     The messages are those of pymavlink.
     """

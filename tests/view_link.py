@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight in the air for the page's control.
+"""Provide a flight in the air for the page's control.
 
 It is a log whose recording seems to go on, and nodes in memory behind the `Link`.
 """
@@ -19,12 +19,12 @@ class InTheAir(Flight):
     """A recorded flight whose recording seems to go on."""
 
     def state(self) -> str:
-        """What the recording does."""
+        """Return what the recording does."""
         return "recording"
 
 
 def in_the_air(flight: Flight) -> Flight:
-    """The same flight, whose recording seems to go on."""
+    """Return the same flight, whose recording seems to go on."""
     other = InTheAir.__new__(InTheAir)
     other.__dict__ = flight.__dict__
     return other
@@ -49,18 +49,21 @@ class NodesInMemory:
         self.blocked, self.cancelled = threading.Event(), threading.Event()
 
     def nodes(self) -> list[str]:
-        """The nodes that run."""
+        """Return the nodes that run."""
         return self.names
 
     def keep_link(self) -> None:
-        """Nothing: no node in memory measures the time."""
+        """Do nothing, because no node in memory measures the time."""
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Those that are set."""
+        """Return the parameters that are set."""
         return {name: self.values[node][name] for name in names if name in self.values[node]}
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Refusal | None:
-        """As a node: the whole set is valid, or nothing changes."""
+        """Set the parameters if the whole set is valid, as a node does.
+
+        Otherwise nothing changes.
+        """
         try:
             self.schemas[node].validate_mapping(nest(self.values[node] | dict(values)), node)
         except ParameterError as error:
@@ -73,31 +76,31 @@ class NodesInMemory:
         return None
 
     def activate(self, *, active: bool) -> Refusal | None:
-        """Kept."""
+        """Keep the request."""
         return self._keep("activate", active)
 
     def send_target(self, values: Mapping[str, float]) -> Refusal | None:
-        """Kept."""
+        """Keep the target."""
         return self._keep("target", values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> Refusal | None:
-        """Kept."""
+        """Keep the route."""
         return self._keep("route", points)
 
     def guide(self, service: str) -> Refusal | None:
-        """Kept; skip is refused."""
+        """Keep the request. `skip` is refused."""
         if service == "skip":
             return Refusal("no route with a further leg is flown")
         return self._keep(service)
 
     def engage(self) -> Refusal | None:
-        """Waits until it is cancelled."""
+        """Wait until the request is cancelled."""
         self.blocked.set()
         self.cancelled.wait(20.0)
         raise ParameterError("cancelled by a later request")
 
     def disengage(self) -> Refusal | None:
-        """Kept."""
+        """Keep the request."""
         return self._keep("disengage")
 
     def cancel(self) -> None:
@@ -109,5 +112,5 @@ class NodesInMemory:
         self.cancelled.clear()
 
     def note(self, text: str) -> None:
-        """Kept."""
+        """Keep the note."""
         self.notes.append(text)

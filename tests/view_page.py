@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The live page of a server of this process, in a browser, with a control of nodes in memory."""
+"""Show the live page of a server in this process, with a control of nodes in memory."""
 
 import asyncio
 import threading
@@ -29,7 +29,7 @@ DRAWN = "Number(document.body?.dataset.drawn ?? 0)"
 def serving(
     *runs: Path, control: Callable[[Flight], Control] | None = None, fleet: bool = False
 ) -> Iterator[str]:
-    """Serve runs from a thread of this process; the address with the token."""
+    """Serve runs from a thread of this process, and yield the address with the token."""
     ready = threading.Event()
     address = ""
     loop = asyncio.new_event_loop()
@@ -65,7 +65,7 @@ def shown(
     control: Callable[[Flight], Control] | None = None,
     fleet: bool = False,
 ) -> Iterator[str]:
-    """Serve finished runs and open the page; leave it before the server ends."""
+    """Serve finished runs, open the page, and leave it before the server ends."""
     with serving(*runs, control=control, fleet=fleet) as address:
         try:
             browser.open(address)
@@ -76,7 +76,7 @@ def shown(
 
 
 def leave(browser: Browser) -> None:
-    """Leave the page, which then logs no refused connection to a server that has ended."""
+    """Leave the page, so that it does not log a refused connection to a server that has ended."""
     browser.open("about:blank")
     browser.wait_for("location.href === 'about:blank'")
 
@@ -88,20 +88,20 @@ def set_camera(browser: Browser, camera: str) -> None:
 
 
 def flown(scenario: Scenario, run: Path) -> Path:
-    """The log of a flight, with its attachments."""
+    """Return the log of a flight, with its attachments."""
     run.mkdir()
     write_run(simulate(scenario), run, attachments_for(scenario, run))
     return run
 
 
 def a_control(flight: Flight, nodes: NodesInMemory, controls: list[Control]) -> Control:
-    """A control of nodes in memory; kept, so that a test can close it."""
+    """Return a control of nodes in memory. It is kept, so that a test can close it."""
     controls.append(Control(in_the_air(flight), nodes, "ABCD-EFGH", assess=delay_margins))
     return controls[-1]
 
 
 def take(browser: Browser, key: str = "abcd-efgh") -> None:
-    """Take control, once the page offers it."""
+    """Take control when the page offers it."""
     browser.wait_for("!document.getElementById('control-key').hidden")
     browser.run(f"document.getElementById('control-typed').value = '{key}'")
     browser.run("void document.getElementById('control-take').click()")

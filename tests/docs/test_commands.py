@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every command of every page exists.
+"""Test that every command of every page exists.
 
-`rise-di` parses it, `make` has the target, ROS 2 the executable, Python the module. The quick ones
-run as they stand. tests/docs/test_pages.py runs all of the tutorials.
+`rise-di` parses it, `make` has the target, ROS 2 the executable, and Python the module. The quick
+ones are run as they stand. tests/docs/test_pages.py runs all commands of the tutorials.
 """
 
 import re
@@ -42,14 +42,14 @@ SOURCES = REPOSITORY / "ros_ws" / "src"
 
 @cache
 def whole_command() -> typer.core.TyperGroup:
-    """`rise-di` with every command, whose modules are imported here."""
+    """Return `rise-di` with every command, whose modules are imported here."""
     command = typer.main.get_command(application([*COMMANDS]))
     assert isinstance(command, typer.core.TyperGroup)
     return command
 
 
 def rise_di(words: list[str]) -> None:
-    """The command and its options exist, and their values have the right types."""
+    """Check that the command and its options exist, and that their values have the right types."""
     command: Any = whole_command()
     name: str | None = "rise-di"
     rest = [*words]
@@ -63,7 +63,7 @@ def rise_di(words: list[str]) -> None:
 
 
 def make(words: list[str]) -> None:
-    """The target exists."""
+    """Check that the target exists."""
     folder = REPOSITORY
     if words[:1] == ["-C"]:
         folder = folder / words[1]
@@ -75,7 +75,7 @@ def make(words: list[str]) -> None:
 
 
 def ros2(words: list[str]) -> None:
-    """The executable is in a package of this workspace, the launch file there has the arguments."""
+    """Check that the workspace has the executable, or the launch file with these arguments."""
     if words[0] == "run":
         assert f'"{words[2]} = ' in (SOURCES / words[1] / "setup.py").read_text()
     elif words[0] == "launch" and words[1].endswith(".launch.py"):
@@ -96,7 +96,7 @@ def ros2(words: list[str]) -> None:
 
 
 def python(words: list[str]) -> None:
-    """The module can be imported."""
+    """Check that the module can be imported."""
     if words[0] == "-m":
         assert find_spec(words[1]) is not None
         assert all(Path(word).exists() for word in words[2:] if word.startswith("tests/"))
@@ -108,7 +108,10 @@ CHECKS = {"rise-di": rise_di, "make": make, "ros2": ros2, "python": python, "pyt
 
 
 def lines(page: Path) -> list[str]:
-    """The lines of the blocks of a page; one that ends with a backslash goes on with the next."""
+    """Return the lines in the blocks of a page.
+
+    A line that ends with a backslash continues in the next one.
+    """
     text = re.sub(r"\\\n *", "", page.read_text())
     return [
         *(line for block in SHELL.findall(text) for line in block.splitlines()),
@@ -117,7 +120,7 @@ def lines(page: Path) -> list[str]:
 
 
 def commands(line: str) -> list[list[str]]:
-    """The words of each command of CHECKS in a line of shell."""
+    """Return the words of each command of CHECKS in a line of shell."""
     lexer = shlex.shlex(line, posix=True, punctuation_chars=";&|<>()")
     lexer.whitespace_split = True
     found: list[list[str]] = []
@@ -141,7 +144,7 @@ def test_commands_of_pages_exist() -> None:
 
 
 def mistake_in(line: str, page: Path) -> str:
-    """Page, line and error of a command that does not exist; empty if all do."""
+    """Return page, line and error of a command that does not exist, or "" if all exist."""
     try:
         for name, *words in (
             commands(line) if any(f"{name} " in f"{line} " for name in CHECKS) else ()

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands and the Python of the tutorials run page by page, each in an empty folder.
+"""Test the commands and the Python of the tutorials, page by page, each in an empty folder.
 
-They run as they stand but for their length: campaigns of two aircraft, a value of a sweep, two
-samples of margins, a trade of one phase margin, flights of two seconds, or three in Python. So do
-the notebooks. They run in the process of the tests, which imports the stack once.
+They run as they stand, except for their length: campaigns have two aircraft, sweeps one value,
+margins two samples, trades one phase margin, and flights two seconds, or three in Python. The
+notebooks run, too. All run in the process of the tests, which imports the stack once.
 """
 
 import json
@@ -48,7 +48,7 @@ pytestmark = pytest.mark.timeout(2.0 * TIMEOUT)
 
 
 def blocks(page: Path) -> list[tuple[str, str, str]]:
-    """Kind, text and the reason for not running it, of each block of a page."""
+    """Return kind, text and the reason for not running it, for each block of a page."""
     return [
         (block["kind"], block["text"], block["reason"] or "")
         for block in BLOCK.finditer(page.read_text())
@@ -56,7 +56,7 @@ def blocks(page: Path) -> list[tuple[str, str, str]]:
 
 
 def environment() -> dict[str, str]:
-    """The environment of a reader who has `rise-di` on the path, without a screen."""
+    """Return the environment of a reader who has `rise-di` on the path and no screen."""
     return os.environ | {
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
         "MPLBACKEND": "agg",
@@ -88,7 +88,7 @@ RISE_DI = """rise-di() {
 
 
 def run_shell(text: str) -> None:
-    """Run a block with bash, and each `rise-di` of it in this process."""
+    """Run a block with bash, and each `rise-di` in it in this process."""
     (asked, asks), (answered, answers) = os.pipe(), os.pipe()
     script = f"exec 3>&{asks} 4<&{answered}\n{RISE_DI}{text}"
     command = ["bash", "-euo", "pipefail", "-c", script]
@@ -145,7 +145,7 @@ def _shorter_work(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def shortened(text: str) -> str:
-    """The commands or the Python of a block with fewer aircraft, samples and seconds."""
+    """Return the commands or the Python of a block with fewer aircraft, samples and seconds."""
     for pattern, replacement in SHORTER:
         text = re.sub(pattern, replacement, text)
     return text
@@ -186,7 +186,7 @@ def test_notebook_runs_and_stored_without_output(
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, built without a warning."""
+    """Return the site, built without a warning."""
     folder = tmp_path_factory.mktemp("site")
     options = ["--strict", "--quiet", "-f", str(REPOSITORY / "mkdocs.yml"), "-d", str(folder)]
     run([sys.executable, "-m", "mkdocs", "build", *options], folder)

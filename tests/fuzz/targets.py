@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzz targets: every reader of external input, as a function of bytes.
+"""Provide fuzz targets: every reader of external input, as a function of bytes.
 
-A target returns for input that is read or rejected with one sentence. It raises any other
-exception. `SEEDS` holds the initial inputs of each target, made by the writers of the stack;
-tests/corpus/<target>/ holds the findings.
+A target returns if the input is read, or rejected with one sentence. It raises any other exception.
+`SEEDS` has the initial inputs of each target, made by the writers of the stack.
+tests/corpus/<target>/ has the findings.
 """
 
 import asyncio
@@ -82,7 +82,7 @@ Target = Callable[[bytes, Path], None]
 
 
 def rejected(call: Callable[[], object]) -> bool:
-    """Whether the call raises ParameterError, which must have one sentence."""
+    """Return whether the call raises ParameterError, which must have one sentence."""
     try:
         call()
     except ParameterError as error:
@@ -100,9 +100,9 @@ def rejected(call: Callable[[], object]) -> bool:
 
 
 def mcap(data: bytes, folder: Path) -> None:
-    """A log: read as a flight, as messages and as a replay; then repaired.
+    """Read a log as a flight, as messages and as a replay, and then repair it.
 
-    The repaired log is not damaged.
+    The repaired log must not be damaged.
     """
     run = write_run(folder, data)
     file = run / "run_0.mcap"
@@ -117,7 +117,7 @@ def mcap(data: bytes, folder: Path) -> None:
 
 
 def _watch(file: Path) -> None:
-    """What the live page gets of a log."""
+    """Read what the live page gets from a log."""
     flight = Flight(file)
     with np.errstate(all="ignore"):
         flight.update()
@@ -125,7 +125,7 @@ def _watch(file: Path) -> None:
 
 
 def metadata(data: bytes, folder: Path) -> None:
-    """metadata.yaml of a bag, and a file of metadata for a bag."""
+    """Read metadata.yaml of a bag, and a file of metadata for a bag."""
     run = write_run(folder, _PLAIN)
     (run / "metadata.yaml").write_bytes(data)
     rejected(lambda: read_bag_metadata(run))
@@ -135,7 +135,7 @@ def metadata(data: bytes, folder: Path) -> None:
 
 
 def scenario(data: bytes, folder: Path) -> None:
-    """A scenario file, up to the controller and the simulator."""
+    """Read a scenario file, up to the controller and the simulator."""
     path = folder / "scenario.yaml"
     path.write_bytes(data)
 
@@ -155,11 +155,11 @@ NUMBER = re.compile(r"-?\b(0x)?[0-9a-f]+(\.[0-9a-f]*)?(p[+-]?\d+)?F?\b")
 
 
 def export(data: bytes, folder: Path) -> None:
-    """Names of channels, one a line, in the place of NAMED in an airframe and its scenario.
+    """Put names of channels, one per line, in the place of NAMED in an airframe and its scenario.
 
-    They go up to the C code and its FMU. Outside of strings and comments the code has the tokens
-    that it has with NAMED. The names reach the code from the files, and past the check of the
-    files.
+    They are used up to the C code and its FMU. Outside of strings and comments, the code has the
+    same tokens as with NAMED. The names reach the code from the files, and also when the check of
+    the files is bypassed.
     """
     lines = data.decode("utf-8", "replace").split("\n")
     names = dict(zip(NAMED, lines, strict=False))
@@ -181,7 +181,7 @@ def export(data: bytes, folder: Path) -> None:
 
 
 def _renamed(tree: Any, names: Mapping[str, str]) -> Any:
-    """A tree of YAML with other names, as keys and as values."""
+    """Return a tree of YAML with other names, as keys and as values."""
     if isinstance(tree, dict):
         return {names.get(key, key): _renamed(value, names) for key, value in tree.items()}
     return (
@@ -192,9 +192,9 @@ def _renamed(tree: Any, names: Mapping[str, str]) -> Any:
 
 
 def _check_code(controller: RiseDiConfig) -> None:
-    """The code has the tokens of the shipped scenario's, but for the numbers.
+    """Check that the code has the tokens of the shipped scenario's, except for the numbers.
 
-    The FMU has the variables of the channels.
+    The FMU must have the variables of the channels.
     """
     text = header(controller, "fuzz", float32=False)
     assert "??" not in text  # a trigraph of C
@@ -215,7 +215,7 @@ def _tokens(text: str) -> list[str]:
 
 
 def airframe(data: bytes, folder: Path) -> None:
-    """An airframe file, up to its matrices."""
+    """Read an airframe file, up to its matrices."""
     path = folder / "airframe.yaml"
     path.write_bytes(data)
 
@@ -229,7 +229,7 @@ def airframe(data: bytes, folder: Path) -> None:
 
 
 def channel_map(data: bytes, folder: Path) -> None:
-    """A channel map, up to its bridge."""
+    """Read a channel map, up to its bridge."""
     path = folder / "map.yaml"
     path.write_bytes(data)
 
@@ -241,7 +241,7 @@ def channel_map(data: bytes, folder: Path) -> None:
 
 
 def message(data: bytes, folder: Path) -> None:
-    """The payload of a message for the readers of a log: alone, and between valid ones."""
+    """Read the payload of a message as a log's reader does, alone and between valid ones."""
     for messages in ([data], [_SAMPLE, data, _SAMPLE]):
         decode = decoder(JOINT_STATE)
         assert decode is not None
@@ -256,7 +256,7 @@ def message(data: bytes, folder: Path) -> None:
 
 
 def route(data: bytes, folder: Path) -> None:
-    """A route or fence file, by each reader."""
+    """Read a route or fence file with each reader."""
     for ending in ENDINGS:
         path = folder / f"route{ending}"
         path.write_bytes(data)
@@ -265,9 +265,9 @@ def route(data: bytes, folder: Path) -> None:
 
 
 def vehicle_log(data: bytes, folder: Path) -> None:
-    """The log of an autopilot.
+    """Read the log of an autopilot.
 
-    It is decoded here: `rise-di import` does it in an isolated process.
+    It is decoded here, while `rise-di import` decodes it in an isolated process.
     """
     path = folder / "vehicle.log"
     path.write_bytes(data)
@@ -277,10 +277,11 @@ def vehicle_log(data: bytes, folder: Path) -> None:
 
 
 def targets(data: bytes, folder: Path) -> None:
-    """Poses, y and targets of guidance, as 64 bit numbers.
+    """Give guidance poses, y and targets as 64 bit numbers.
 
-    What a step commands is finite and inside its slew limits. After a time without steps beyond the
-    age limit of u_m, guidance starts again at what is measured: no limit holds across it.
+    What a step commands must be finite and within its slew limits. After a time without steps
+    beyond the age limit of u_m, guidance starts again at what is measured, and no limit applies
+    across it.
     """
     guidance = Guidance(_guided())
     params = _guided().params()
@@ -316,7 +317,7 @@ def targets(data: bytes, folder: Path) -> None:
 
 
 def control(data: bytes, folder: Path) -> None:
-    """The body of a request that commands a flight from its page."""
+    """Send the body of a request that commands a flight from its page."""
     loop, _, desk, _ = _page()
     try:
         request = json.loads(data)
@@ -332,7 +333,10 @@ def control(data: bytes, folder: Path) -> None:
 
 
 def page(data: bytes, folder: Path) -> None:
-    """Bytes to the server of the page. It logs no exception, and answers the next browser."""
+    """Send bytes to the server of the page.
+
+    It must log no exception, and answer the next browser.
+    """
     loop, server, _, failed = _page()
     loop.run_until_complete(_exchange(server, data.replace(b"PORT", str(server.port).encode())))
     assert not failed, failed.pop()
@@ -364,9 +368,9 @@ def _guided() -> GuidanceConfig:
 
 @lru_cache(maxsize=1)
 def _page() -> tuple[asyncio.AbstractEventLoop, Server, Control, list[str]]:
-    """A server with control of nodes in memory, its event loop, and its exceptions.
+    """Return a server with control of nodes in memory, its event loop, and its exceptions.
 
-    They are those that it has logged.
+    These are the exceptions that it has logged.
     """
     folder = Path(tempfile.mkdtemp(prefix="fuzz"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -409,7 +413,7 @@ TARGETS: Mapping[str, Target] = {
 
 
 def write_run(folder: Path, content: bytes) -> Path:
-    """The folder of a run that holds this log alone."""
+    """Return the folder of a run that has only this log."""
     run = folder / "run"
     run.mkdir(exist_ok=True)
     for file in run.iterdir():
@@ -434,9 +438,9 @@ def log(
     chunked: bool = True,
     indexed: bool = True,
 ) -> bytes:
-    """An MCAP file of (topic, type, payload), 1 ms apart.
+    """Return an MCAP file of (topic, type, payload), 1 ms apart.
 
-    By default it has no checksums, which would reveal a changed byte.
+    By default it has no checksums, because they would reveal a changed byte.
     """
     stream = BytesIO()
     index = IndexType.ALL if indexed else IndexType.NONE
@@ -571,7 +575,7 @@ def _numbers() -> list[bytes]:
 
 
 def _vehicle_logs() -> list[bytes]:
-    """A log of each kind, with a rate gyro alone."""
+    """Return a log of each kind, with a rate gyro alone."""
     stamps = range(0, 400_000, 20_000)
     rates = [(stamp, (0.1, -0.2, 0.3)) for stamp in stamps]
     packets = [

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of the command line.
+"""Test the command line with random input.
 
-Invalid input gives an exit status and one sentence, no traceback, no hang.
+Invalid input must give an exit status and one sentence, and no traceback or hang.
 """
 
 import io
@@ -22,7 +22,7 @@ from flight_cli import cli
 
 
 class CommandResult(NamedTuple):
-    """Exit status and output of a command."""
+    """The exit status and the output of a command."""
 
     status: int
     output: str
@@ -30,7 +30,10 @@ class CommandResult(NamedTuple):
 
 
 def rise_di(*arguments: str) -> CommandResult:
-    """Run the command in this process. An exception other than SystemExit would be a traceback."""
+    """Run the command in this process.
+
+    An exception other than SystemExit would be a traceback.
+    """
     output = io.StringIO()
     errors = io.StringIO()
     status = 0
@@ -50,7 +53,7 @@ def rise_di(*arguments: str) -> CommandResult:
 
 
 def require_rejection(result: CommandResult) -> None:
-    """Require exit status 2 and one sentence, or the usage text of Typer for an invalid option."""
+    """Require exit status 2 and one sentence, or Typer's usage text for an invalid option."""
     assert result.status == 2, result
     assert "Traceback" not in result.errors
     sentences = [line for line in result.errors.splitlines() if line.startswith("error: ")]
@@ -64,7 +67,7 @@ def require_rejection(result: CommandResult) -> None:
 
 @pytest.fixture
 def garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of invalid files, which is the working folder."""
+    """Change to a folder of invalid files."""
     monkeypatch.chdir(tmp_path)
     contents = {"empty": b"", "zeros": bytes(4096), "text": b"not a log", "magic": b"\x89MCAP0\r\n"}
     for name, content in (contents | {"cut": SEEDS["mcap"]()[0][:700]}).items():

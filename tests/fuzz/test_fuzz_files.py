@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of file readers.
+"""Test the readers of files with random content.
 
 Any content is read or rejected with one sentence, in bounded time and memory.
 """
@@ -57,7 +57,7 @@ BINARY = {
 
 @st.composite
 def damaged(draw: st.DrawFn, name: str) -> bytes:
-    """A valid input that is truncated, or with changed, removed or duplicated bytes."""
+    """Draw a valid input that is truncated, or has changed, removed or duplicated bytes."""
     data = bytearray(draw(st.sampled_from(BINARY[name])))
     for _ in range(draw(st.integers(1, 4))):
         place, end = sorted((draw(st.integers(0, len(data))), draw(st.integers(0, len(data)))))
@@ -129,7 +129,7 @@ def to_yaml(tree: Any) -> str:
 
 @st.composite
 def edited(draw: st.DrawFn, seeds: list[Any], write: Callable[[Any], str] = to_yaml) -> bytes:
-    """A valid file with some other values or keys."""
+    """Draw a valid file with some other values or keys."""
     tree = yaml.safe_load(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(1, 3))):
         node = tree
@@ -259,7 +259,7 @@ NUMBER = st.floats() | st.sampled_from([0.0, 1.0, 1e300, -1e300, 5e-324])
 
 @st.composite
 def flights(draw: st.DrawFn, complete: dict[str, tuple[str, ...]]) -> list[tuple[str, str, bytes]]:
-    """Messages of a flight with some correct topics, channels, stamps and values."""
+    """Draw messages of a flight with some correct topics, channels, stamps and values."""
     messages = []
     for topic, names in [
         *complete.items(),
@@ -292,7 +292,7 @@ def channels(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 @pytest.fixture
 def reported(tmp_path: Path, osprey_gust: Scenario) -> Report:
-    """Reads messages as a flight of the default scenario."""
+    """Return a function that reads messages as a flight of the default scenario."""
 
     def report(read: Callable[[Path], object], messages: list[tuple[str, str, bytes]]) -> None:
         run = write_run(

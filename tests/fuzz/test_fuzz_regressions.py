@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Regressions found by fuzzing: tracebacks, hangs and excessive memory."""
+"""Test what fuzzing has found: tracebacks, hangs and excessive memory."""
 
 import json
 import tracemalloc
@@ -40,7 +40,7 @@ BOMBS = [
 def constant_flight(
     scenario: Scenario, value: float = 0.0, name: str = "osprey_gust.yaml"
 ) -> bytes:
-    """The log of three samples of y, y_m and u with one value, and of its scenario."""
+    """Return the log of three samples of y, y_m and u with one value, and of its scenario."""
     outputs = scenario.controller.outputs
     inputs = scenario.controller.inputs
     messages = [

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units, output matrix and identities of an airframe file.
+"""Test units, output matrix and identities of an airframe file.
 
-They are held against published factors, python-control and wrong files.
+They are compared with published factors and python-control, and wrong files are refused.
 """
 
 from collections.abc import Callable, Mapping
@@ -28,7 +28,7 @@ NAVION, F4C, B747 = PUBLISHED.values()
 
 
 def airframe(values: Mapping[str, Any]) -> Airframe:
-    """An airframe, checked as a file is."""
+    """Return an airframe, checked as a file is."""
     checked = Airframe.validate_mapping(values, "airframe plane")
     check_identities(checked)
     return checked
@@ -37,7 +37,7 @@ def airframe(values: Mapping[str, Any]) -> Airframe:
 def exchanged(
     key: str, i: int, j: int, axis: int = 0
 ) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
-    """A change that exchanges two rows or columns of a matrix."""
+    """Return a change that exchanges two rows or columns of a matrix."""
 
     def change(values: Mapping[str, Any]) -> dict[str, Any]:
         matrix = np.array(values[key])
@@ -51,7 +51,7 @@ def exchanged(
 def scaled(
     key: str, i: int, j: int, factor: float
 ) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
-    """A change that multiplies an entry of a matrix."""
+    """Return a change that multiplies an entry of a matrix."""
 
     def change(values: Mapping[str, Any]) -> dict[str, Any]:
         matrix = np.array(values[key])
@@ -62,12 +62,12 @@ def scaled(
 
 
 def states(**units: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
-    """A change of units of states."""
+    """Return a change of units of states."""
     return lambda values: {"states": values["states"] | units}
 
 
 def first_input(**values: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
-    """A change of the unit or the sign of the first input."""
+    """Return a change of the unit or the sign of the first input."""
 
     def change(frame: Mapping[str, Any]) -> dict[str, Any]:
         name, channel = next(iter(frame["inputs"].items()))
@@ -161,7 +161,7 @@ def test_file_has_its_speed_with_a_unit_and_is_named_when_its_ending_is_wrong(
 
 
 def test_multirotor_in_hover_is_not_refused() -> None:
-    """No control surface: the coupling with the speed is absent near hover."""
+    """Near hover there is no coupling with the speed, because there is no control surface."""
     values = {
         "states": {"q": "rad/s", "w": "m/s", "theta": "rad"},
         "inputs": {
@@ -176,7 +176,7 @@ def test_multirotor_in_hover_is_not_refused() -> None:
 
 
 def test_height_is_a_state() -> None:
-    """h_dot = V0 (theta - alpha), in ft beside speeds in kt: the units convert at the edge."""
+    """h_dot is V0 (theta - alpha), in ft while speeds are in kt. The file converts the units."""
     kt = 1852.0 / 3600.0
     ft = 0.3048
     V0 = 20.0
@@ -218,7 +218,7 @@ def test_height_is_a_state() -> None:
     ],
 )  # fmt: skip
 def test_factors_are_the_published_ones(unit: str, factor: float) -> None:
-    """NIST SP 811, appendix B.8."""
+    """The factors are from NIST SP 811, appendix B.8."""
     assert si_per_unit(unit) == pytest.approx(factor, rel=2e-6)
 
 
@@ -237,9 +237,9 @@ def test_text_with_a_unit_becomes_si() -> None:
 
 
 def body_axes(alpha: float = 0.16) -> tuple[dict[str, Any], Airframe]:
-    """The Navion turned by a trim angle of attack to u, w of body axes.
+    """Return the Navion turned by a trim angle of attack to u, w of body axes.
 
-    V = u cos + w sin; and the same in V, w.
+    V = u cos + w sin. The Navion in V, w is returned as well.
     """
     sine = np.sin(alpha)
     cosine = np.cos(alpha)
@@ -257,7 +257,7 @@ def body_axes(alpha: float = 0.16) -> tuple[dict[str, Any], Airframe]:
 
 
 def test_output_of_body_axes_has_the_transfer_function_of_stability_axes() -> None:
-    """python-control: C (s I - A)^-1 B at 1 rad/s, and the invariant zeros."""
+    """python-control computes C (s I - A)^-1 B at 1 rad/s, and the invariant zeros."""
     values, stability = body_axes()
     body = airframe(values)
     responses = [

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframes from python-control, SciPy, MATLAB, AVL and XFLR5.
+"""Test airframes from python-control, SciPy, MATLAB, AVL and XFLR5.
 
-They are held against the printed matrices of a book and the library.
+They are compared with the printed matrices of a book and with the library.
 """
 
 from pathlib import Path
@@ -92,7 +92,7 @@ BODY = {
 
 
 def tool_file(folder: Path, name: str, text: str) -> Path:
-    """A file of a tool."""
+    """Write a file of a tool."""
     path = folder / name
     path.write_text(text)
     return path
@@ -116,7 +116,7 @@ def test_state_space_becomes_the_airframe_of_the_library(system: Any) -> None:
 
 
 def test_gusts_are_minus_the_columns_of_the_flow() -> None:
-    """W. MacKunis et al. 2010 take the gust as minus the column of alpha; w is V0 alpha."""
+    """W. MacKunis et al. 2010 take a gust as minus the column of alpha, where w is V0 alpha."""
     frame, _ = import_airframe(SYSTEM, thrust=True, **NAMES)
     assert_allclose(frame.gust_direction("vertical")[:3], -frame.matrix_a()[:3, 1], rtol=1e-4)
     assert "theta" not in frame.gusts["vertical"]
@@ -125,7 +125,7 @@ def test_gusts_are_minus_the_columns_of_the_flow() -> None:
 def test_body_axes_give_the_airspeed_along_the_path() -> None:
     """u_dot has -W0 q and w_dot has U0 q, so V = u cos(alpha_0) + w sin(alpha_0).
 
-    It is 9.4 deg in Cook's example 4.2.
+    In Cook's example 4.2 alpha_0 is 9.4 deg.
     """
     f4c = np.array(
         [
@@ -184,7 +184,7 @@ def test_matlab_file_carries_names(tmp_path: Path) -> None:
 def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
     """Nelson prints the lateral matrix on p. 199 and the longitudinal derivatives on p. 153.
 
-    They are without alpha_dot: M_q = -2.05.
+    These have no alpha_dot, so that M_q is -2.05.
     """
     frame, note = import_airframe(
         tool_file(tmp_path, "navion.st", AVL_ST), speed="176 ft/s", thrust=True, **BODY
@@ -222,9 +222,9 @@ def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
 
 
 def supra(axes: float) -> str:
-    """AVL's system matrix of the sailplane Supra as a user of AVL posted it.
+    """Return AVL's system matrix of the sailplane Supra, as a user of AVL posted it.
 
-    It is longitudinal, with an elevator per deg.
+    It is longitudinal, with an elevator in deg.
     """
     longitudinal = [
         [-0.0486, 2.397, -0.6799, -9.81],
@@ -264,7 +264,7 @@ def supra(axes: float) -> str:
 
 @pytest.mark.parametrize("axes", [1.0, -1.0], ids=["forward", "aft"])
 def test_avl_system_matrix_has_the_published_eigenvalues(tmp_path: Path, axes: float) -> None:
-    """The same user prints AVL's eigenvalues: -9.466 +-3.209j, -0.1385 +-0.668j, 6.824 m/s."""
+    """The user printed AVL's eigenvalues: -9.466 +-3.209j and -0.1385 +-0.668j at 6.824 m/s."""
     frame, _ = import_airframe(tool_file(tmp_path, "supra.txt", supra(axes)), speed=6.824)
     poles = np.linalg.eigvals(frame.matrix_a()[:4, :4])
     assert_allclose(
@@ -415,7 +415,7 @@ def test_command_writes_airframe_and_scenario(
 
 
 def test_f4c_of_tutorial_follows_from_the_derivatives_of_the_book() -> None:
-    """Cook, examples 4.2 and 4.3: the dimensionless derivatives in body axes, kg, m, s.
+    """Cook's examples 4.2 and 4.3 have the dimensionless derivatives in body axes, kg, m, s.
 
     The mass matrix has w_dot and Ixz.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Dockerfiles and the compose file against the tree, without a container engine."""
+"""Test the Dockerfiles and the compose file against the tree, without a container engine."""
 
 import re
 from pathlib import Path
@@ -22,7 +22,7 @@ SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 
 
 def instructions(dockerfile: Path) -> list[tuple[str, str]]:
-    """Each instruction of a Dockerfile with its arguments, in order."""
+    """Return each instruction of a Dockerfile with its arguments, in order."""
     lines = [
         line for line in dockerfile.read_text().splitlines() if line and not line.startswith("#")
     ]
@@ -69,7 +69,7 @@ def test_no_service_has_a_network() -> None:
 
 
 def test_only_link_of_autopilot_is_open() -> None:
-    """The agent's topics and the flight's are on one loopback interface.
+    """The topics of the agent and of the flight are on one loopback interface.
 
     It has the stack's own profile.
     """
@@ -103,9 +103,9 @@ def test_only_link_of_autopilot_is_open() -> None:
 
 
 def test_flight_of_autopilot_is_dry_unless_it_told_to_send(tmp_path: Path) -> None:
-    """The command is expanded by compose without variables, except for the scenario.
+    """compose expands the command without variables, except for the scenario.
 
-    It ends at the scenario, which is missing.
+    The command ends at the scenario, which does not exist.
     """
     command = re.sub(
         r"\$\{SCENARIO:\?[^}]*\}", str(tmp_path / "absent.yaml"), AUTOPILOT["flight"]["command"]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The pages: tables, links, anchors, and what their first screen says."""
+"""Test the pages: tables, links, anchors, and what their first screen says."""
 
 import re
 from pathlib import Path
@@ -32,7 +32,7 @@ LINKED = (
 
 
 def prose(page: Path) -> str:
-    """The text of a page without code blocks, code spans and formulas."""
+    """Return the text of a page without code blocks, code spans and formulas."""
     text = re.sub(r"^(```.*?^```|    .*?$)", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     return re.sub(r"`[^`\n]*`|\$\$.*?\$\$|\$[^$]*\$", "", text, flags=re.DOTALL)
 
@@ -42,7 +42,7 @@ def links(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors that GitHub gives to the headings of a page."""
+    """Return the anchors that GitHub gives to the headings of a page."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
     return {
         re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings
@@ -54,7 +54,7 @@ def name(path: Path) -> str:
 
 
 def test_rows_have_a_cell_for_each_column() -> None:
-    """Below a heading; a | in a formula would begin a cell, on GitHub and on the site."""
+    """The cells are counted below a heading, and a | in a formula would begin a cell."""
     bad = []
     for page in PAGES:
         text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Logs of autopilots from elsewhere, decoded in an isolated process.
+"""Test logs of autopilots from elsewhere, which are decoded in an isolated process.
 
 Its time and memory follow from their size.
 """
@@ -25,7 +25,10 @@ def message(kind: str, body: bytes) -> bytes:
 
 
 def nested(count: int) -> bytes:
-    """A ULog with `count` x `count` fields in a message: pyulog makes a name for each of them."""
+    """Return a ULog with `count` x `count` fields in a message.
+
+    pyulog makes a name for each of them.
+    """
     formats = (f"bomb:uint64_t timestamp;b[{count}] x;", f"b:float[{count}] y;")
     added = message("A", struct.pack("<BH", 0, 1) + b"bomb")
     return (
@@ -40,7 +43,11 @@ def nested(count: int) -> bytes:
 def test_log_that_claims_more_values_than_a_message_holds_is_refused(
     count: int, tmp_path: Path
 ) -> None:
-    """65,535 bytes at most, the length of a message in 16 bits (PX4 guide, ULog file format)."""
+    """A log that claims more values than a message can have is refused.
+
+    A message has at most 65,535 bytes, because its length has 16 bits (PX4 guide, ULog file
+    format).
+    """
     path = tmp_path / "nested.ulg"
     path.write_bytes(nested(count))
     with refusing(rf"cannot be decoded \(a message bomb of {count * count + 1} values\)"):

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Who may import whom, by one table.
+"""Test who may import whom, by one table.
 
-It is held against the imports of every source file and against docs/architecture.md.
+The table is compared with the imports of every source file and with docs/architecture.md.
 """
 
 import ast
@@ -30,9 +30,9 @@ IMPORTS: dict[str, set[str]] = {
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Full names of all modules that a file imports, wherever in the file.
+    """Return the full names of all modules that a file imports, anywhere in the file.
 
-    For `from a import b` both a and a.b.
+    For `from a import b` these are a and a.b.
     """
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
@@ -44,12 +44,12 @@ def imported_modules(path: Path) -> set[str]:
 
 
 def imported(path: Path) -> set[str]:
-    """Top-level names of all modules that a file imports."""
+    """Return the top-level names of all modules that a file imports."""
     return {name.split(".")[0] for name in imported_modules(path)}
 
 
 def unit_of(module: str) -> str | None:
-    """The unit of the table that a module belongs to, None for a module of others."""
+    """Return the unit of the table that a module belongs to, or None for a foreign module."""
     return next((unit for unit in IMPORTS if module == unit or module.startswith(f"{unit}.")), None)
 
 
@@ -69,7 +69,7 @@ FILES = sorted(
 
 
 def test_mathematics_never_imports_ros() -> None:
-    """Nodes, executables, clients, flight_ros and launch files do."""
+    """Only nodes, executables, clients, flight_ros and launch files import ROS."""
     foreign = [
         f"{path.relative_to(SOURCES)} imports {name}"
         for path in FILES
@@ -81,7 +81,7 @@ def test_mathematics_never_imports_ros() -> None:
 
 
 def test_units_import_what_the_table_says() -> None:
-    """No file imports more, no unit less."""
+    """No file imports more than the table says, and no unit imports less."""
     unused = {unit: set(units) for unit, units in IMPORTS.items()}
     wrong = []
     for path in FILES:
@@ -119,7 +119,7 @@ def test_no_unit_imports_itself_over_others() -> None:
 
 
 def test_no_file_imports_itself_over_others() -> None:
-    """Imports inside functions and under TYPE_CHECKING count: they only hide a circle."""
+    """Imports inside functions and under TYPE_CHECKING count, because they only hide a circle."""
     files = {module_of(path).removesuffix(".__init__"): path for path in FILES}
     graph = {
         module: (imported_modules(path) & files.keys()) - {module} for module, path in files.items()
@@ -143,7 +143,7 @@ def test_architecture_page_shows_table_in_layers() -> None:
 
 
 def modules_loaded_by(code: str) -> set[str]:
-    """Top-level names of the modules that a fresh interpreter has loaded after some code."""
+    """Return the top-level names of the modules that an interpreter has loaded after some code."""
     code = f"import sys\n{code}\nprint(*{{name.split('.')[0] for name in sys.modules}})"
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(shown.stdout.split())
@@ -210,7 +210,7 @@ def test_private_names_of_rclpy_are_in_one_file() -> None:
 
 
 def has_private_names(path: Path) -> bool:
-    """Whether a file imports rclpy.impl, or reads a `handle` beside an import of rclpy."""
+    """Return whether a file imports rclpy.impl, or imports rclpy and reads a `handle`."""
     text = path.read_text()
     nodes = list(ast.walk(ast.parse(text))) if "rclpy" in text else []
     modules = [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The isolated process: what foreign code or a foreign file can reach from it.
+"""Test the isolated process: what foreign code or a foreign file can reach from it.
 
-What comes back is checked too.
+What it returns is checked, too.
 """
 
 import ctypes
@@ -47,7 +47,7 @@ class Found(NamedTuple):
 
 
 class Evil:
-    """What pickles as a call of a function."""
+    """An object that is pickled as a call of a function."""
 
     def __reduce__(self) -> Any:
         return (os.system, ("true",))
@@ -59,7 +59,7 @@ def call(function: Any, *arguments: Any, **limits: Any) -> Any:
 
 @pytest.fixture(autouse=True)
 def of_this_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The subprocess finds this module."""
+    """Let the subprocess find this module."""
     monkeypatch.setenv(
         "PYTHONPATH",
         os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]),
@@ -103,7 +103,7 @@ def test_result_of_another_module_is_refused() -> None:
 
 
 def test_class_that_the_module_only_imports_is_refused() -> None:
-    """StrEnum itself would make new classes."""
+    """StrEnum itself could make new classes."""
     pickled = f"c{__name__}\nStrEnum\n.".encode()
     with pytest.raises(isolated.IsolatedCallError, match=r"\.StrEnum, which is no plain value$"):
         isolated._Reader(BytesIO(pickled), __name__).load()
@@ -136,7 +136,7 @@ def test_memory_is_limited() -> None:
 
 @cache
 def confines() -> bool:
-    """Whether this kernel permits all of it, asked in a process that loses it."""
+    """Return whether this kernel permits all of it. A process that is then confined asks for it."""
     code = (
         "from pathlib import Path; from flight_core.confinement import confine; raise "
         "SystemExit(len(confine(Path())))"
@@ -163,7 +163,7 @@ WAYS = ("write", "append", "cut", "remove", "replace", "beside", "link", "folder
 
 
 def changes(path: str) -> list[str]:
-    """Write a file in the working folder; the ways by which a file of the user's was changed."""
+    """Write a file in the working folder. Return the ways in which a user's file was changed."""
     Path("own").write_text("own")
     file = Path(path)
     ways: dict[str, Callable[[], object]] = {
@@ -199,7 +199,7 @@ def test_kernel_that_refuses_confinement_is_said_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Kernel:
-        """Refuses every call."""
+        """A kernel that refuses every call."""
 
         def __getattr__(self, name: str) -> Any:
             return lambda *_arguments: (ctypes.set_errno(1) and -1) or -1

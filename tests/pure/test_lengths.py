@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Functions fit on a page of an editor, files into a head."""
+"""Test that functions fit on a page of an editor, and that a file is not too long to remember."""
 
 import ast
 

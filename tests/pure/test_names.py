@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of channels, states and inputs.
+"""Test the names of channels, states and inputs.
 
-One grammar at every file, and an escape in every text of another language.
+All files have one grammar, and every text in another language escapes them.
 """
 
 from collections.abc import Callable
@@ -41,9 +41,9 @@ HOSTILE = ("q*/", 'q"', "q\\", "??/", "<q>", "q: 1", "q\n", "1q", "", "q,p", "na
 
 
 def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The paths of the names of channels, states and inputs in a file.
+    """Return the paths of the names of channels, states and inputs in a file.
 
-    Entries of a list, and keys of a mapping.
+    Names are entries of a list, or keys of a mapping.
     """
     if not isinstance(tree, dict):
         return []
@@ -57,7 +57,7 @@ def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def renamed(tree: Any, path: tuple[Any, ...], name: str) -> Any:
-    """A copy of a tree with another name at a path."""
+    """Return a copy of a tree with another name at a path."""
     key, *rest = path
     if rest:
         return {**tree, key: renamed(tree[key], tuple(rest), name)}
@@ -118,7 +118,7 @@ def test_name_outside_of_the_grammar_is_refused_at_each_place(
 
 
 def test_every_file_of_the_repository_has_names_of_the_grammar() -> None:
-    """With the examples, whose files other tests read."""
+    """The examples are included, whose files other tests read."""
     files = [
         path
         for path in sorted((REPOSITORY / "examples").rglob("*.yaml"))
@@ -132,7 +132,7 @@ def test_every_file_of_the_repository_has_names_of_the_grammar() -> None:
 
 @pytest.mark.parametrize("name", ["../osprey", "a/b", "/x"])
 def test_airframe_whose_name_leaves_the_folder_is_refused(name: str, tmp_path: Path) -> None:
-    """NAME.yaml is written into the folder that the user gives."""
+    """NAME.yaml would be written into the folder that the user gives."""
     source = tmp_path / "source.yaml"
     source.write_text(
         dump_yaml(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text()) | {"name": name})

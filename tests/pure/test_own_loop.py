@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller in a loop of the user's own and in python-control.
+"""Test the controller in a loop of the user and in python-control.
 
-The aircraft as an environment of gymnasium is beside them.
+The aircraft as an environment of gymnasium is tested, too.
 """
 
 import re
@@ -34,12 +34,15 @@ FLIGHT = "rise_di.flight_env:rise_di/Flight-v0"
 
 @pytest.fixture(scope="module")
 def flown() -> Tape:
-    """A pulse, noise and servos. y has no delay here, so each tick has the y of its instant."""
+    """Return a flight with a pulse, noise and servos.
+
+    y has no delay here, so each tick has the y of its instant.
+    """
     return rise_di.simulate(SCENARIO)
 
 
 def columns(tape: Tape, topic: str, names: tuple[str, ...]) -> FloatArray:
-    """Samples of a topic at the ticks, (N, m), in the law's order."""
+    """Return samples of a topic at the ticks, (N, m), in the law's order."""
     signal = tape[topic]
     at = np.isin(signal.stamp_ns, tape["u"].stamp_ns)
     return np.array([signal[name][at] for name in names]).T
@@ -156,7 +159,7 @@ def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
 
 @pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer", "osprey_twin"])
 def test_linear_systems_have_the_eigenvalues_and_margins_of_the_loop(name: str) -> None:
-    """python-control closes plant and law by itself; the margins are those of the product."""
+    """python-control closes plant and law by itself, and the margins are those of the product."""
     scenario = rise_di.find_scenario(name)
     plant, law, loop = rise_di.linear_systems(scenario)
     m = len(plant.input_labels)
@@ -191,7 +194,7 @@ def test_environment_passes_checks_of_gymnasium() -> None:
     ],
 )
 def test_environment_is_found_by_name(modules: str, name: str) -> None:
-    """With the module before the colon in any order of imports."""
+    """The environment is found in any order of imports, if the module stands before the colon."""
     code = f"import {modules}; print(gymnasium.make({name!r}).spec.id)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "rise_di/Flight-v0", done.stderr
@@ -238,7 +241,7 @@ def test_aircraft_beyond_its_bounds_terminates_with_an_observation_within_them()
 
 
 def test_example_trains_a_policy() -> None:
-    """Each generation draws about the best of the one before: the mean return of the best rises."""
+    """Each generation draws around the best of the last one, so the best mean return rises."""
     process = subprocess.run(
         [sys.executable, REPOSITORY / "examples/gymnasium/cross_entropy.py", "2"],
         capture_output=True,
@@ -291,9 +294,9 @@ def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_environments_draw_entries_of_scenario() -> None:
-    """An entry at one of its limits.
+    """An entry is at one of its limits.
 
-    After the same thrust, V is that of 10 % or of 190 % of the effect.
+    After the same thrust, V shows 10 % or 190 % of the effect.
     """
     own = SCENARIO.vary(
         aircraft={
@@ -317,9 +320,9 @@ def test_environments_draw_entries_of_scenario() -> None:
 
 
 def test_vector_environment_flies_as_environments_one_by_one() -> None:
-    """The fleet's linear steps against the simulator's integration.
+    """The fleet has linear steps, and the simulator integrates.
 
-    Their difference is that of the campaign's figures.
+    They differ by as much as the figures of a campaign do.
     """
     flights = rise_di.FlightVectorEnv(SCENARIO, 3, uncertainty=0.0)
     alone = rise_di.FlightEnv(SCENARIO)
@@ -369,7 +372,7 @@ def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() ->
 
 @pytest.mark.parametrize("name, actions", [("osprey_learn", 4), ("osprey_twin", 7)])
 def test_vector_environment_takes_a_learner_and_an_allocation(name: str, actions: int) -> None:
-    """The agent acts in place of the learner; it commands the effectors of the allocation."""
+    """The agent replaces the learner, and commands the effectors of the allocation."""
     flights = rise_di.FlightVectorEnv(rise_di.find_scenario(name, 1.0), 2)
     assert flights.action_space.shape == (2, actions)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every package is a correct ament_python package: its files agree, and it is installed."""
+"""Test that every package is a correct ament_python package whose files agree and are installed."""
 
 import configparser
 import os
@@ -54,7 +54,7 @@ WITHOUT_KEY = {
 
 
 def check_packages(mistakes: Callable[[Path], Iterable[object]]) -> None:
-    """Fail with the mistakes in all packages, one a line."""
+    """Fail with the mistakes in all packages, one in each line."""
     lines = [f"{package.name}: {mistake}" for package in PACKAGES for mistake in mistakes(package)]
     assert not lines, "\n".join(lines)
 
@@ -64,7 +64,7 @@ def test_package_files_agree_with_each_other() -> None:
 
 
 def disagreements(package: Path) -> list[str]:
-    """The statements about a package's files that do not hold."""
+    """Return the statements about a package's files that are not true."""
     name = package.name
     root = ElementTree.parse(package / "package.xml").getroot()
     setup = (package / "setup.py").read_text()
@@ -97,7 +97,7 @@ def test_packages_declare_all_that_they_import() -> None:
 
 
 def undeclared(package: Path) -> set[str]:
-    """Imported packages of others without an exec_depend."""
+    """Return the imported foreign packages without an exec_depend."""
     root = ElementTree.parse(package / "package.xml").getroot()
     declared = {node.text for node in root.findall("exec_depend")}
     sources = [path for path in package.rglob("*.py") if path.name != "setup.py"]
@@ -141,7 +141,7 @@ def test_each_folder_of_tests_is_of_a_package() -> None:
 
 
 def test_pytest_runs_the_tests_of_a_package() -> None:
-    """The command pytest is run in the folder of a package, with the arguments of `colcon test`."""
+    """pytest is run in the folder of a package, with the arguments of `colcon test`."""
     command = [sys.executable, "-m", "pytest", "-o", "cache_dir=cache", "--collect-only", "-qq"]
     done = subprocess.run(
         command, cwd=SOURCES / "flight_recorder", capture_output=True, text=True, check=False
@@ -162,7 +162,7 @@ def test_packages_install_their_data_files() -> None:
 
 
 def uninstalled_data(package: Path) -> set[Path]:
-    """Data files that setup.py does not name.
+    """Return the data files that setup.py does not name.
 
     A symlinked build has all files of the package folder.
     """

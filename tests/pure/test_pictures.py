@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of the documentation show what the pages say, by today's code."""
+"""Test that the pictures of the documentation show what the pages say, drawn by today's code."""
 
 import json
 import re
@@ -22,14 +22,14 @@ LARGEST = 150_000  # bytes of a picture: a repository keeps each version
 
 
 def texts(drawing: Path) -> list[str]:
-    """The texts of an SVG."""
+    """Return the texts of an SVG."""
     tree = ElementTree.parse(drawing)
     found = (text.text for text in tree.iter("{http://www.w3.org/2000/svg}text"))
     return [text for text in found if text]
 
 
 def title(picture: Path) -> str | None:
-    """What a picture says that it shows."""
+    """Return what a picture says that it shows."""
     if picture.suffix == ".svg":
         return ElementTree.parse(picture).findtext(".//{http://purl.org/dc/elements/1.1/}title")
     with Image.open(picture) as image:
@@ -37,7 +37,7 @@ def title(picture: Path) -> str | None:
 
 
 def shown_in(page: Path) -> list[tuple[str, str]]:
-    """The pictures of a page, each with its text and the line below it."""
+    """Return the pictures of a page, each with its text and the line below it."""
     picture = r"^!\[(.*?)\]\((?:docs/)?images/(.*?)\)\n(?=(.*\n.*))"
     pictures = re.findall(picture, page.read_text(), re.MULTILINE)
     return [(name, f"{text} {below}") for text, name, below in pictures]
@@ -64,7 +64,7 @@ def test_picture_and_its_pages_name_the_flight_that_it_shows(name: str) -> None:
 
 @pytest.mark.slow
 def test_first_picture_is_of_the_flight_beside_it() -> None:
-    """The errors of the picture are those of `rise-di fly`, which first flies this scenario."""
+    """The picture has the errors of this scenario, which `rise-di fly` flies first."""
     tape = simulate(find_scenario(DEFAULT))
     expected = {name: part["whole"]["rms"] for name, part in summarise(tape)["errors"].items()}
     with Image.open(IMAGES / "report.png") as image:

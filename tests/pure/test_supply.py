@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the project takes from others.
+"""Test what the project takes from others.
 
-Locked packages without an advisory, and releases that no package can change.
+Locked packages must have no advisory, and no package may change a release.
 """
 
 import re
@@ -23,7 +23,7 @@ LOCKED = re.findall(
 
 
 def affected(row: dict[str, str]) -> bool:
-    """Whether a locked version is in one of the ranges, which "|" separates."""
+    """Return whether a locked version is in one of the ranges, which "|" separates."""
     ranges = [SpecifierSet(text) for text in row["affected"].split("|")]
     return any(
         Version(version) in versions
@@ -80,7 +80,7 @@ def test_one_job_has_rights() -> None:
 def test_job_with_rights_runs_no_program_of_others(name: str, job: dict[str, Any]) -> None:
     """A package that runs there could change what is published.
 
-    It could publish in the name of the project too.
+    It could also publish in the name of the project.
     """
     steps = job["steps"]
     actions = {step["uses"].partition("@")[0] for step in steps if "uses" in step}
@@ -102,7 +102,7 @@ def test_what_is_published_has_the_checksums_of_the_build() -> None:
 
 
 def test_build_of_a_release_runs_one_script() -> None:
-    """Of which the next test holds the installations."""
+    """The next test checks what this script installs."""
     assert (
         next(step["run"] for step in RELEASE["build"]["steps"] if "run" in step)
         == '.ci/release "$GITHUB_REF_NAME"'

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""docs/symbols.md against code and tests.
+"""Test docs/symbols.md against code and tests.
 
-Each equation has a test, and a docstring that names it; each name exists.
+Each equation has a test and a docstring that names it, and each name exists.
 """
 
 import ast
@@ -28,7 +28,7 @@ LAST_EQUATION = 52  # of the paper
 
 
 def rows(page: str, heading: str) -> list[list[str]]:
-    """The cells of the table whose first column has this heading."""
+    """Return the cells of the table whose first column has this heading."""
     table = re.search(rf"^\| {heading} \|.*\n\|---.*\n((?:\|.*\n)+)", page, re.MULTILINE)
     assert table is not None, heading
     return [line.strip("| ").split(" | ") for line in table[1].splitlines()]
@@ -39,15 +39,15 @@ def spans(text: str) -> list[str]:
 
 
 def numbers(text: str) -> set[int]:
-    """Numbers of equations: "(5) to (9)", "(5)-(9)" are five."""
+    """Return the numbers of equations. "(5) to (9)" and "(5)-(9)" are five."""
     ends = re.findall(r"(?<!\w)\((\d+)\)(?:(?:-| to )\((\d+)\))?", text)
     return {number for first, last in ends for number in range(int(first), int(last or first) + 1)}
 
 
 def resolve(name: str) -> Any:
-    """The object of a name that begins with a module of the packages.
+    """Return the object of a name that begins with a module of the packages.
 
-    A field without a default is its annotation.
+    For a field without a default, this is its annotation.
     """
     module, *parts = name.split(".")
     (path,) = SOURCES.glob(f"*/*/**/{module}.py")
@@ -62,7 +62,7 @@ def resolve(name: str) -> Any:
 
 
 def marked() -> set[int | str]:
-    """The arguments of all marks `equation` of the tests."""
+    """Return the arguments of all marks `equation` of the tests."""
     texts = (path.read_text() for path in TESTS.rglob("test_*.py"))
     trees = (ast.parse(text) for text in texts if "mark.equation" in text)
     calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
@@ -80,7 +80,7 @@ def test_the_page_names_every_equation() -> None:
 
 
 def test_each_equation_has_a_test() -> None:
-    """A mark names a row of the page by its number, or by its words where it has none."""
+    """A mark names a row of the page by its number, or by its words if it has none."""
     labels: set[int | str] = set()
     for head, *_ in rows(PAGE, "equation"):
         labels |= numbers(head) or {head}
@@ -98,7 +98,7 @@ def test_docstrings_name_their_equations() -> None:
 
 @pytest.fixture(scope="module")
 def channels(osprey_gust: Scenario) -> Mapping[str, Sequence[str]]:
-    """Channels by topic in the default scenario."""
+    """Return the channels by topic in the default scenario."""
     outputs = osprey_gust.controller.outputs
     inputs = osprey_gust.controller.inputs
     return {
@@ -110,7 +110,7 @@ def channels(osprey_gust: Scenario) -> Mapping[str, Sequence[str]]:
 
 
 def test_names_on_the_page_exist(channels: Mapping[str, Sequence[str]]) -> None:
-    """Code, channels of a topic, parameters of the reference."""
+    """The names are in the code, in a topic, or in the reference of the parameters."""
     sections = re.split(r"^## `(\w+)`", parameters.page(), flags=re.MULTILINE)[1:]
     keys = {
         f"{section}.{key}"

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How the tests over DDS wait.
+"""Test how the tests over DDS wait.
 
-By tests/ros/waiting.py alone, never for a time, and for each message that they read.
+They use only tests/ros/waiting.py, never wait for a time, and wait for each message that they read.
 """
 
 import ast
@@ -26,9 +26,9 @@ random instants."""
 
 
 def appended(tree: ast.AST) -> set[str]:
-    """The names of the lists to which a subscription appends.
+    """Return the names of the lists to which a subscription appends.
 
-    `create_subscription(..., NAME.append, ...)`.
+    The call is `create_subscription(..., NAME.append, ...)`.
     """
     calls = (
         node
@@ -45,7 +45,7 @@ def appended(tree: ast.AST) -> set[str]:
 
 
 def name_of(node: ast.AST) -> str:
-    """The last name of an expression; of `a.b["c"]` it is b."""
+    """Return the last name of an expression. For `a.b["c"]` it is b."""
     if isinstance(node, ast.Subscript):
         return name_of(node.value)
     return (
@@ -58,7 +58,7 @@ def name_of(node: ast.AST) -> str:
 
 
 def aliases(tree: ast.AST) -> set[str]:
-    """The names of the lists of a peer: `NAME = peer.received["y"]`."""
+    """Return the names of a peer's lists, as in `NAME = peer.received["y"]`."""
     assigned = (node for node in ast.walk(tree) if isinstance(node, ast.Assign))
     pairs = (
         pair
@@ -77,16 +77,16 @@ def targets(node: ast.expr) -> list[ast.expr]:
 
 
 def is_end(node: ast.expr) -> bool:
-    """Whether an index is that of the first or of the last element."""
+    """Return whether an index is the one of the first or of the last element."""
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
         node = node.operand
     return isinstance(node, ast.Constant) and isinstance(node.value, int)
 
 
 def faults(source: str) -> Iterator[str]:
-    """Each wait for a time, and each index into a list that a message must have filled.
+    """Yield each wait for a time, and each index into a list that a message must have filled.
 
-    Its line is beside it.
+    Each has its line.
     """
     tree = ast.parse(source)
     lists = appended(tree) | aliases(tree) | {"received"}

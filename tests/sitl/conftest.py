@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tests with a real autopilot in software: `make test-sitl`.
+"""Test with a real autopilot in software: `make test-sitl`.
 
-They are skipped, with the reason, where the kit cannot run.
+The tests are skipped, with the reason, if the kit cannot run.
 """
 
 import os
@@ -14,7 +14,10 @@ from tests.sitl.kit import ArduPlane, Px4, missing
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip where something is missing. The hook of a folder gets the tests of the whole session."""
+    """Skip the tests if something is missing.
+
+    The hook of a folder gets the tests of the whole session.
+    """
     items_here = [item for item in items if Path(__file__).parent in item.path.parents]
     if items_here and (reason := missing()):
         for item in items_here:
@@ -23,13 +26,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def domain_of_the_autopilots() -> None:
-    """The autopilots are in domain 0, in networks of their own."""
+    """Use domain 0, in which the autopilots are, in networks of their own."""
     os.environ.pop("ROS_DOMAIN_ID", None)
 
 
 @pytest.fixture(scope="module")
 def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
-    """An ArduPlane in flight, with servos of 0.03 s."""
+    """Yield an ArduPlane in flight, with servos of 0.03 s."""
     autopilot = ArduPlane(tmp_path_factory.mktemp("run"))
     try:
         autopilot.up(SIM_SERVO_SPEED=0.03)
@@ -41,7 +44,7 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
 
 @pytest.fixture(scope="module")
 def px4(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Px4]:
-    """PX4's airplane in flight.
+    """Yield PX4's airplane in flight.
 
     Without a stick it goes on, and without an offboard heartbeat it changes to Hold.
     """

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The kits of autopilots in software.
+"""Control the kits of autopilots in software.
 
-A kit is started and stopped, commanded, and flown by commands of the stack beside it. The kits are
-no part of this repository. RISE_DI_SITL names the folder of ArduPlane's, by default ../shared/sitl
-beside the checkout; that of PX4 is its folder px4. Their READMEs say what they need. PILOT_PYTHON
-is an interpreter with pymavlink, by default python3.
+A kit is started, stopped and commanded, and flown by commands of the stack. The kits are not part
+of this repository. RISE_DI_SITL names the folder of ArduPlane's, by default ../shared/sitl beside
+the checkout. The folder px4 in it is PX4's. Their READMEs say what they need. PILOT_PYTHON is an
+interpreter with pymavlink, by default python3.
 """
 
 import csv
@@ -72,7 +72,7 @@ ALTITUDE = 300.0
 
 
 def missing() -> str:
-    """Why the kits cannot run here; empty where they can."""
+    """Return why the kits cannot run here, or "" if they can."""
     for script in (KIT / "sitl", KIT / "px4" / "sitl"):
         if not script.is_file():
             return f"no {script}: RISE_DI_SITL names the folder of the kit"
@@ -95,9 +95,9 @@ def missing() -> str:
 
 
 class Autopilot:
-    """An autopilot and its agent in a network of their own.
+    """An autopilot and its agent in their own network.
 
-    It has the flights of the stack beside it.
+    It has the flights of the stack.
     """
 
     script: Path
@@ -119,7 +119,7 @@ class Autopilot:
             restarted.wait(10.0)
 
     def say(self, *words: str) -> str:
-        """The answer to a command."""
+        """Return the answer to a command."""
         return self._call("say", *words, timeout=30.0)
 
     def _call(self, action: str, *words: str, timeout: float, **environment: str) -> str:
@@ -137,7 +137,7 @@ class Autopilot:
         return text.strip()
 
     def kill(self, *programs: str) -> Callable[[], None]:
-        """Kill processes of the kit; what is returned starts them again as the kit started them."""
+        """Kill processes of the kit. The returned function starts them again as the kit did."""
         pids = [int(line) for line in (self.folder / "pids").read_text().split()]
         parents = [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
 
@@ -188,13 +188,13 @@ class Autopilot:
         return self._processes[-1]
 
     def state(self) -> dict[str, Any]:
-        """What the autopilot says of itself now."""
+        """Return what the autopilot says about itself now."""
         raise NotImplementedError
 
     def until(
         self, condition: Callable[[dict[str, Any]], bool], timeout: float = 60.0
     ) -> dict[str, Any]:
-        """Poll the state until a condition holds."""
+        """Poll the state until a condition is true."""
         deadline = time.monotonic() + timeout
         while not condition(state := self.state()):
             assert time.monotonic() < deadline, f"not within {timeout} s; {state}"
@@ -208,11 +208,11 @@ class Autopilot:
     def hand_over(self) -> None:
         """Change to the mode in which the stack is engaged.
 
-        Needed where the bridge does not ask for it.
+        This is needed if the bridge does not ask for it.
         """
 
     def patient_map(self, name: str, *changes: tuple[str, str]) -> str:
-        """A copy of a map with longer ages, and further changes of its text."""
+        """Return a copy of a map with longer ages, and with further changes of its text."""
         text = find_map(name).read_text()
         for old, new in (
             ("max_age: 0.2 ", f"max_age: {MAX_AGE} "),
@@ -225,7 +225,7 @@ class Autopilot:
         return str(path)
 
     def engage(self, *options: str) -> Process:
-        """Start `rise-di engage`, as the autopilot needs it where no options are given."""
+        """Start `rise-di engage`, by default with the options that the autopilot needs."""
         return self.start("engage", *(options or self.engage_options))
 
     def fly(self, scenario: Path, channel_map: str, duration: float, *options: str) -> Process:
@@ -245,9 +245,9 @@ class Autopilot:
     def engaged(
         self, scenario: Path, channel_map: str, duration: float, *, transmitter: bool = False
     ) -> Iterator[Process]:
-        """A flight of the stack, engaged from level flight.
+        """Yield a flight of the stack, engaged from level flight.
 
-        Afterwards the autopilot flies level in its own mode. `transmitter`: whether the bridge
+        Afterwards the autopilot flies level in its own mode. `transmitter` says whether the bridge
         watches the transmitter.
         """
         self.level()
@@ -264,9 +264,9 @@ class Autopilot:
             self.level()
 
     def requested(self, *options: str) -> Process:
-        """The end of `rise-di engage`, requested again until the rates of a MAVLink link are known.
+        """Request `rise-di engage` until the rates of a MAVLink link are known, and return its end.
 
-        They are known 2 s after its begin.
+        They are known 2 s after its beginning.
         """
         for _ in range(ENGAGEMENTS):
             request = self.start("engage", *options)
@@ -275,7 +275,7 @@ class Autopilot:
         return request
 
     def _engage_level(self, *options: str) -> None:
-        """Engage, again from level flight where the aircraft climbs or sinks at the hand-over.
+        """Engage, and do so again from level flight if the aircraft climbs or sinks then.
 
         It does so after a jammed surface.
         """
@@ -303,22 +303,22 @@ class Autopilot:
 
     @property
     def run(self) -> Path:
-        """The folder of the last flight."""
+        """Return the folder of the last flight."""
         return (self.folder / "runs" / "latest").resolve()
 
     def summary(self) -> dict[str, Any]:
-        """The summary of the last flight.
+        """Return the summary of the last flight.
 
-        Its outcome, and its engagements with start, stop, reason.
+        It has the outcome, and the engagements with start, stop and reason.
         """
         figures: dict[str, Any] = json.loads((self.run / "summary.json").read_text())
         return figures
 
 
 def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
-    """The text of a scenario under guidance by rule in place of its commands.
+    """Return the text of a scenario whose commands are replaced by guidance by rule.
 
-    `program` has times, s, and values by channel. The poses of a busy host may be MAX_AGE old.
+    `program` has times, s, and values by channel. On a busy host, the poses may be MAX_AGE old.
     """
     content = yaml.safe_load(scenario.read_text())
     reference = content["/**/reference_model"]["ros__parameters"]
@@ -335,9 +335,9 @@ def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
 
 
 def followed(tape: Tape, name: str, start: float, stop: float) -> float:
-    """The part of y that goes along with y_m from start to stop, s, over y_m.
+    """Return the part of y that follows y_m from start to stop, s, as a fraction of y_m.
 
-    It is the largest at a delay below 0.6 s.
+    It is the largest one at a delay below 0.6 s.
     """
     y = tape["y"]
     y_m = tape["y_m"]
@@ -355,7 +355,7 @@ def followed(tape: Tape, name: str, start: float, stop: float) -> float:
 class Agreement(NamedTuple):
     """A signal of the stack over the autopilot's own.
 
-    It is taken at the delay between both with the smallest residual.
+    It is taken at the delay between them with the smallest residual.
     """
 
     # by orthogonal regression: the instants of both jitter, so an ordinary one, with noise in one
@@ -366,7 +366,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(t: FloatArray, logged: FloatArray, t_y: FloatArray, y: FloatArray) -> Agreement:
-    """The agreement of y(t_y) with logged(t)."""
+    """Return the agreement of y(t_y) with logged(t)."""
     fits = []
     for delay in np.arange(-0.3, 0.3, 0.005):
         delayed = np.interp(t + delay, t_y, y)
@@ -425,7 +425,7 @@ class ArduPlane(Autopilot):
         self._call("up", str(PROFILE), timeout=90.0, EXTRA_PARM=str(extra))
 
     def state(self) -> dict[str, Any]:
-        """Mode, attitude, speed, sticks and servos."""
+        """Return mode, attitude, speed, sticks and servos."""
         state: dict[str, Any] = json.loads(self.say("get"))
         return state
 
@@ -455,7 +455,7 @@ class ArduPlane(Autopilot):
 
     @contextmanager
     def without_transmitter(self) -> Iterator[None]:
-        """The transmitter is lost."""
+        """Lose the transmitter."""
         self.say("param", "SIM_RC_FAIL", "1")
         try:
             yield
@@ -473,7 +473,7 @@ class ArduPlane(Autopilot):
     def restart(self) -> None:
         """End the autopilot and start it again, on the ground.
 
-        Its ground station notices no other way.
+        Its ground station does not notice this in another way.
         """
         again = self.kill("pilot.py", "arduplane")
         (self.folder / "pilot.sock").unlink()
@@ -484,9 +484,9 @@ class ArduPlane(Autopilot):
             time.sleep(POLL)
 
     def log(self, kind: str, *fields: str) -> tuple[FloatArray, FloatArray]:
-        """The autopilot's own log over MAVLink.
+        """Return the autopilot's own log over MAVLink.
 
-        The times of arrival, s of the system clock, and the fields.
+        It has the times of arrival, s of the system clock, and the fields.
         """
         with (self.folder / "mavlink.csv").open(encoding="utf-8", newline="") as file:
             rows = [
@@ -499,16 +499,16 @@ class ArduPlane(Autopilot):
         )
 
     def mavlink_map(self, *changes: tuple[str, str]) -> str:
-        """The map `ardupilot_mavlink` with longer ages, on the second serial port.
+        """Return the map `ardupilot_mavlink` with longer ages, on the second serial port.
 
-        The ground station of the kit is beside it.
+        The ground station of the kit is connected, too.
         """
         return self.patient_map(
             "ardupilot_mavlink", ("url: udpin:127.0.0.1:14551", "url: tcp:127.0.0.1:5763"), *changes
         )
 
     def shared_map(self) -> str:
-        """The map `ardupilot_mavlink` with longer ages, on the link of `shared_link`.
+        """Return the map `ardupilot_mavlink` with longer ages, on the link of `shared_link`.
 
         It has the number of its station.
         """
@@ -520,7 +520,7 @@ class ArduPlane(Autopilot):
     def shared_link(self) -> Iterator[Callable[[str], None]]:
         """Start `tests.sitl.shared_link`, whose station is the autopilot's.
 
-        The function that is returned sends it a word.
+        The returned function sends it a word.
         """
         path = str(self.folder / "link.sock")
         link = self._module("tests.sitl.shared_link", path)
@@ -540,14 +540,15 @@ class ArduPlane(Autopilot):
             self.say("param", "MAV_GCS_SYSID", "255")
 
     def dataflash(self) -> Path:
-        """The newest log that the autopilot wrote itself."""
+        """Return the newest log that the autopilot wrote itself."""
         return max((self.folder / "logs").glob("*.BIN"), key=lambda path: path.stat().st_mtime)
 
     def own_errors(self, ratio: float = 1.0) -> dict[str, tuple[float, float]]:
-        """The rms of the autopilot's own log less y_m, and of y_m, by channel.
+        """Return the rms of the autopilot's own log minus y_m, and of y_m, by channel.
 
-        It covers the engaged time in which y_m is commanded. V is the sensor's, as a deviation from
-        its value at the engagement, times `ratio`, of true over equivalent airspeed.
+        It covers the engaged time in which y_m is commanded. V is measured by the sensor, as a
+        deviation from its value at the engagement, times `ratio`, which is the true over the
+        equivalent airspeed.
         """
         log = read_run(self.run)
         (span,) = log.engagements or []
@@ -579,9 +580,9 @@ class ArduPlane(Autopilot):
     def turns(
         self, starts: Sequence[float], altitude: float, speed: float
     ) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
-        """A program of guidance: at each start a turn, a climb or sink, and a change of airspeed.
+        """Return a program of guidance with manoeuvres at each start, s.
 
-        A start is in s, the turn TURN, the climb or sink 15 m, the change 1 m/s more or less.
+        They are the turn TURN, a climb or sink of 15 m, and a change of the airspeed by 1 m/s.
         """
         self.state()  # writes the log
         heading = float(self.log("ATTITUDE", "yaw")[1][-1, 0])
@@ -606,7 +607,7 @@ class ArduPlane(Autopilot):
         flight.succeed()
 
     def compare(self) -> dict[str, Agreement]:
-        """The rates and the pose of the last flight with the autopilot's own log."""
+        """Compare the rates and the pose of the last flight with the autopilot's own log."""
         tape = read_run(self.run).tape
         compared = {}
         for topic, kind, rows in LOGGED:
@@ -645,7 +646,7 @@ class Px4(Autopilot):
         )
 
     def listen(self, topic: str, *names: str) -> dict[str, float]:
-        """Fields of the newest message of a topic of uORB."""
+        """Return fields of the newest message of a topic of uORB."""
         lines = [
             line.strip().partition(":")
             for line in self.say("listener", topic, "-n", "1").splitlines()
@@ -661,7 +662,7 @@ class Px4(Autopilot):
         return numbers
 
     def state(self) -> dict[str, Any]:
-        """nav_state and arming_state, altitude above home."""
+        """Return nav_state, arming_state, and the altitude above home."""
         state = self.listen("vehicle_status", "nav_state", "arming_state")
         height = self.listen("vehicle_local_position", "z", "vz")
         return {**state, "alt": -height.get("z", 0.0), "climb": -height.get("vz", 0.0)}
@@ -710,7 +711,7 @@ class Px4(Autopilot):
         return self._module(name, *arguments, path=str(self.tools))
 
     def parameter(self, name: str) -> float:
-        """The value of a parameter of PX4."""
+        """Return the value of a parameter of PX4."""
         return float(self.say("param", "show", "-q", name).splitlines()[-1])
 
     def restart(self) -> None:
@@ -721,7 +722,7 @@ class Px4(Autopilot):
     def watching_truth(self) -> Iterator[Callable[[], Signal]]:
         """Ask the simulator for its own p, q, r ten times a second.
 
-        The function that is returned gives them, rad/s, by the system clock.
+        The returned function gives them, rad/s, by the system clock.
         """
         samples: list[tuple[float, FloatArray]] = []  # s of the system clock; p, q, r
         has_ended = Event()
@@ -764,7 +765,7 @@ class Px4(Autopilot):
             asking.join()
 
     def mode_changed(self) -> float:
-        """When nav_state changed last, s of the monotonic clock."""
+        """Return when nav_state changed last, s of the monotonic clock."""
         status = self.listen("vehicle_status", "timestamp", "nav_state_timestamp")
         return (
             time.monotonic()

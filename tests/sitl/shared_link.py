@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A link that the bridge shares with a ground station, and that can be cut.
+"""Share a link between the bridge and a ground station, and cut it.
 
 It is started in the autopilot's network: `python -m tests.sitl.shared_link SOCKET`. Bytes pass
 between the autopilot's second serial port (TCP) and the bridge (UDP). The station sends a heartbeat
-each second, both ways. The datagrams on SOCKET are `cut`, `join`, `silence`, `speak` and `take`:
-request 4 Hz of all messages, as MAVProxy does.
+each second, both ways. The datagrams on SOCKET are `cut`, `join`, `silence`, `speak` and `take`.
+The last one requests 4 Hz of all messages, as MAVProxy does.
 """
 
 import select
@@ -24,7 +24,7 @@ BEAT = 1.0  # s
 
 
 def main(path: str) -> None:
-    """Pass the bytes on until the process is ended."""
+    """Pass the bytes on until the process ends."""
     control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     control.bind(path)
     autopilot = socket.create_connection(AUTOPILOT, 5.0)

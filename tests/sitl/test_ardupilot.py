@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map `ardupilot` against ArduPlane's own DDS interface and its own log over MAVLink."""
+"""Test the map `ardupilot` against ArduPlane's own DDS interface and its own log over MAVLink."""
 
 import struct
 import time
@@ -41,21 +41,21 @@ RC_OVERRIDE_TIME = 3.0  # s, the autopilot's default: without a new Joy the last
 
 
 def map_of(plane: ArduPlane, *, captured: bool = True) -> str:
-    """The map of a rehearsal as it is, or the shipped one with longer ages."""
+    """Return the map of a rehearsal as it is, or the shipped one with longer ages."""
     changes = () if captured else (("captured: true", "captured: false"),)
     return OWN_MAP or plane.patient_map("ardupilot", *changes)
 
 
 def engaged(plane: ArduPlane, duration: float) -> AbstractContextManager[Process]:
-    """A flight of the stack, engaged from level flight with the sticks in trim."""
+    """Return a flight of the stack, engaged from level flight with the sticks in trim."""
     return plane.engaged(SCENARIO.path, map_of(plane), duration)
 
 
 def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
-    """In turns and climbs rates and pose are those of its own log.
+    """In turns and climbs, rates and pose are those of the autopilot's own log.
 
-    Slopes of 1 within 1 %, and V its airspeed within 5 %. V is the airspeed of its estimator,
-    VFR_HUD that of the sensor, an equivalent one. In the autopilot they differ by 3 %.
+    The slopes are 1 within 1 %, and for V within 5 %. V is the airspeed of its estimator, and
+    VFR_HUD has the one of the sensor, an equivalent airspeed. In the autopilot they differ by 3 %.
     """
     plane.level()
     channel_map = map_of(plane, captured=False)  # V before an engagement too
@@ -94,10 +94,10 @@ def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
 
 
 def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
-    """While they are commanded the errors of q and p stay below y_m.
+    """While q and p are commanded, their errors stay below y_m.
 
     Every tick of the log replays. An aircraft that does not follow has a ratio of 1 or more. Calm
-    flights had 0.63, 0.49; with identified gains 0.43, 0.17.
+    flights had 0.63 and 0.49, and with identified gains 0.43 and 0.17.
     """
     with engaged(plane, SCENARIO.flight.duration) as flight:
         flight.succeed(SCENARIO.flight.duration + 30.0)
@@ -123,11 +123,12 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
 
 
 def test_turbulence_moves_aircraft_as_much_as_under_autopilots_own_law(plane: ArduPlane) -> None:
-    """The rms of q while engaged is at most twice that in GUIDED just before.
+    """The rms of q while engaged is at most twice the one in GUIDED just before.
 
-    It is by the autopilot's log; the envelope may end the engagement. SIM_WIND_TURB 2 moves q by
-    0.4 rad/s in GUIDED, far more than a command: an error would tell of the wind. The rms of 8 s
-    differs from one time to the next; a law at its limit of stability has several times as much.
+    It is taken from the autopilot's log, and the envelope may end the engagement. SIM_WIND_TURB 2
+    moves q by 0.4 rad/s in GUIDED, which is far more than a command, so that an error would show
+    the wind. The rms of 8 s differs from one time to the next. A law at its limit of stability has
+    several times as much.
     """
     before = 8.0  # s in GUIDED
     with ExitStack() as afterwards:
@@ -154,12 +155,13 @@ def test_turbulence_moves_aircraft_as_much_as_under_autopilots_own_law(plane: Ar
     "turns", [1, pytest.param(10, marks=[pytest.mark.long, pytest.mark.timeout(1000)])]
 )
 def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: int) -> None:
-    """A minute for each turn, climb and change of airspeed, engaged to the end.
+    """The flight is engaged to its end, with a minute for each turn, climb and change of airspeed.
 
-    All are held again after 45 s, altitude and airspeed within the bands in which a guided flight
-    counts as settled, 5 m and 1 m/s. The gyro of the simulator drifts by up to b = 4.4 mrad/s,
-    SIM_DRIFT_SPEED 0.05 deg/s a minute for 5 minutes, and heading is off by b g / (k_phi k_chi V):
-    2.6 deg for the bandwidth of p in the example. 2 deg are those of a settled heading.
+    All are held again after 45 s. The bands for altitude and airspeed are those in which a guided
+    flight counts as settled, 5 m and 1 m/s. The gyro of the simulator drifts by up to b = 4.4
+    mrad/s, which is SIM_DRIFT_SPEED 0.05 deg/s a minute for 5 minutes. So the heading is off by b g
+    / (k_phi k_chi V), 2.6 deg for the bandwidth of p in the example. A settled heading may be off
+    by 2 deg.
     """
     first, each = 15.0, 60.0  # s
     starts = (first + each * np.arange(turns)).tolist()
@@ -188,7 +190,7 @@ def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: i
 class Event(NamedTuple):
     """What ends an engagement, and the reason in the summary.
 
-    The third is when the sticks act again, s after the event.
+    The third field is when the sticks act again, s after the event.
     """
 
     act: Callable[[ArduPlane, Process], Callable[[], object] | None]
@@ -261,7 +263,7 @@ def test_sticks_that_bridge_overrides_do_not_show_and_do_not_act_before_release(
 ) -> None:
     """The autopilot shows Joy in channels 1 to 4.
 
-    An override by a stick of these would act on the law's own u.
+    An override by one of these sticks would react to the law's own u.
     """
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
@@ -276,10 +278,10 @@ def test_sticks_that_bridge_overrides_do_not_show_and_do_not_act_before_release(
 def test_the_pilot_has_the_aircraft_again(
     plane: ArduPlane, name: str, record_testsuite_property: Callable[[str, object], None]
 ) -> None:
-    """Within the time of the event the sticks act, and the log says why the engagement ended.
+    """The sticks act within the time of the event, and the log says why the engagement ended.
 
-    The time of a release begins with it in the log: `rise-di engage --off` takes half a second to
-    start.
+    The time of a release is measured from the release in the log, because `rise-di engage --off`
+    takes half a second to start.
     """
     event = EVENTS[name]
     channel_map = (
@@ -306,9 +308,9 @@ def test_the_pilot_has_the_aircraft_again(
 
 
 def sticks_act(plane: ArduPlane, since: float) -> float:
-    """The time from which on the rudder channel is where its stick is, s of the system clock.
+    """Return when the rudder channel begins to be where its stick is, s of the system clock.
 
-    It stays there for 0.5 s at least.
+    It must stay there for 0.5 s at least.
     """
     deadline = time.monotonic() + 10.0
     while time.monotonic() < deadline:
@@ -322,7 +324,7 @@ def sticks_act(plane: ArduPlane, since: float) -> float:
 
 
 def test_max_engaged_ends_an_engagement_without_transmitter(plane: ArduPlane) -> None:
-    """No field tells the loss, and Joy keeps the autopilot's own RC failsafe off.
+    """No field shows the loss, and Joy keeps the autopilot's own RC failsafe off.
 
     The failsafe acts after the release.
     """
@@ -343,9 +345,9 @@ def test_max_engaged_ends_an_engagement_without_transmitter(plane: ArduPlane) ->
 
 
 def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane) -> None:
-    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale.
+    """With four busy processes per core for 3 s, the bridge stays engaged or says what was stale.
 
-    Then a release acts at once.
+    A release then acts immediately.
     """
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
@@ -362,7 +364,7 @@ def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane)
 
 @pytest.mark.parametrize("what", ["agent", "autopilot"])
 def test_the_stack_engages_again_after_a_restart(plane: ArduPlane, what: str) -> None:
-    """One flight of the stack goes on while agent or autopilot are away.
+    """The same flight of the stack goes on while the agent or the autopilot is away.
 
     The restarted aircraft takes off again.
     """

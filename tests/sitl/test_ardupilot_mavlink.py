@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map `ardupilot_mavlink` against ArduPlane's MAVLink.
+"""Test the map `ardupilot_mavlink` against ArduPlane's MAVLink.
 
-What the bridge releases, refuses and flies through.
+The tests check what the bridge releases, refuses and flies through.
 """
 
 import re
@@ -27,7 +27,7 @@ SERVOS = {"aileron": 1, "elevator": 2, "thrust": 3, "rudder": 4}
 
 @pytest.fixture(scope="module")
 def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
-    """An ArduPlane in flight, with servos of 0.03 s and a short timeout of overrides."""
+    """Yield an ArduPlane in flight, with servos of 0.03 s and a short timeout of overrides."""
     autopilot = ArduPlane(tmp_path_factory.mktemp("run"))
     try:
         autopilot.up(SIM_SERVO_SPEED=0.03, RC_OVERRIDE_TIME=OVERRIDE_TIME)
@@ -40,14 +40,14 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
 def engaged(
     plane: ArduPlane, duration: float, *changes: tuple[str, str]
 ) -> AbstractContextManager[Process]:
-    """A flight of the stack, engaged from level flight with the sticks in trim."""
+    """Return a flight of the stack, engaged from level flight with the sticks in trim."""
     return plane.engaged(SCENARIO.path, plane.mavlink_map(*changes), duration)
 
 
 def test_engaged_flight_over_mavlink_tracks_its_commands(plane: ArduPlane) -> None:
-    """As over DDS: while they are commanded the errors of q and p stay below y_m.
+    """While q and p are commanded, their errors stay below y_m, as over DDS.
 
-    The errors are by the autopilot's log, and ticks replay.
+    The errors are from the autopilot's log, and the ticks replay.
     """
     with engaged(plane, SCENARIO.flight.duration) as flight:
         flight.succeed(SCENARIO.flight.duration + 30.0)
@@ -62,7 +62,7 @@ def test_engaged_flight_over_mavlink_tracks_its_commands(plane: ArduPlane) -> No
 class Trouble(NamedTuple):
     """What fails, by parameters, and a pattern of the reason.
 
-    The pattern is empty where the bridge flies on. The time for it is in s.
+    The pattern is empty if the bridge flies on. The time for it is in s.
     """
 
     parameters: Sequence[tuple[str, float]]
@@ -71,7 +71,7 @@ class Trouble(NamedTuple):
 
 
 def stuck(surface: str, pulse: float) -> tuple[tuple[str, float], ...]:
-    """A servo that stays at a pulse, us: its ends are 2 us apart."""
+    """Return parameters of a servo that stays at a pulse, us. Its ends are 2 us apart."""
     number = SERVOS[surface]
     return tuple(
         (f"SERVO{number}_{end}", pulse + shift)
@@ -108,7 +108,7 @@ HEALTHY = {
 def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
     plane: ArduPlane, name: str, record_testsuite_property: Callable[[str, object], None]
 ) -> None:
-    """A surface that does not move, an engine or an airspeed sensor that fails end it.
+    """A surface that does not move, or an engine or airspeed sensor that fails, ends the flight.
 
     A spare sensor takes over.
     """
@@ -144,7 +144,7 @@ def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
 def waiting(
     plane: ArduPlane, sentence: str = "DISENGAGED", channel_map: str = ""
 ) -> Iterator[Process]:
-    """A flight of the stack that says a sentence and waits for an engagement."""
+    """Yield a flight of the stack that says a sentence and waits for an engagement."""
     plane.level()
     flight = plane.fly(SCENARIO.path, channel_map or plane.mavlink_map(), 100.0, "--send")
     try:
@@ -181,7 +181,7 @@ def test_transmitter_lost_before_an_engagement_refuses_it_by_the_mode(plane: Ard
 
 
 def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPlane) -> None:
-    """No field tells the loss, and the override keeps the autopilot's own failsafe off.
+    """No field shows the loss, and the override keeps the autopilot's own failsafe off.
 
     The failsafe acts after the release.
     """
@@ -198,7 +198,7 @@ def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPla
 
 
 def mode_after(plane: ArduPlane, change: Callable[[], object], seconds: float) -> set[str]:
-    """The modes of the autopilot in the seconds after a change."""
+    """Return the modes of the autopilot in the seconds after a change."""
     change()
     modes = set()
     end = time.monotonic() + seconds
@@ -214,7 +214,7 @@ SILENT = 8.0  # s, longer than the 5 s of FS_LONG_TIMEOUT and of station_silence
 
 @pytest.fixture
 def failsafe(plane: ArduPlane) -> Iterator[None]:
-    """The autopilot changes to RTL without its ground station."""
+    """Let the autopilot change to RTL without its ground station."""
     for parameter, value in FAILSAFE:
         plane.say("param", parameter, f"{value:g}")
     yield
@@ -240,7 +240,10 @@ def test_rates_that_a_ground_station_takes_refuse_an_engagement_and_come_back(
 def test_rates_that_a_ground_station_takes_while_engaged_are_requested_again_or_end_it(
     plane: ArduPlane, repeats: int
 ) -> None:
-    """Taken once, the rates come back and the flight goes on. Taken without end, they end it."""
+    """If they are taken once, the rates come back and the flight goes on.
+
+    If they are taken again and again, the flight ends.
+    """
     with (
         plane.shared_link() as link,
         plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight,

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map of `examples/px4_airplane` against PX4's own uXRCE-DDS client.
+"""Test the map of `examples/px4_airplane` against PX4's own uXRCE-DDS client.
 
-Into offboard, and back into a mode of PX4's own.
+The tests change to offboard, and back to a mode of PX4 itself.
 """
 
 import time
@@ -28,18 +28,18 @@ SHORT_LOSS = 0.3  # s: three heartbeats
 
 
 def engaged(px4: Px4, duration: float) -> AbstractContextManager[Process]:
-    """A flight of the stack, engaged from Hold, straight ahead."""
+    """Return a flight of the stack, engaged from Hold, straight ahead."""
     return px4.engaged(
         SCENARIO.path, OWN_MAP or px4.patient_map(str(EXAMPLE / "map.yaml")), duration
     )
 
 
 def test_engaged_flight_tracks_commands_in_offboard(px4: Px4) -> None:
-    """The part of y that goes along with y_m has half to one and a half of its size.
+    """The part of y that follows y_m has half to one and a half of its size.
 
-    Thrust is off its limits, ticks replay. The noise of its gyro is larger than the commands: rms
-    50 mrad/s in q and 104 in p, in Hold too. The part is uncertain by 0.1, and in a flight it was
-    1.04 in q, 0.93 in p, 0.83 in V, 0.25 s after y_m.
+    Thrust is not at its limits, and the ticks replay. The noise of the gyro is larger than the
+    commands: it has an rms of 50 mrad/s in q and 104 in p, also in Hold. The part is uncertain by
+    0.1. In a flight it was 1.04 in q, 0.93 in p, and 0.83 in V, 0.25 s after y_m.
     """
     with engaged(px4, SCENARIO.flight.duration) as flight:
         assert px4.state()["nav_state"] == OFFBOARD
@@ -59,7 +59,7 @@ def test_engaged_flight_tracks_commands_in_offboard(px4: Px4) -> None:
 class Event(NamedTuple):
     """What ends an engagement, and the reason in the summary.
 
-    The third is the time until a mode of PX4's own flies, s.
+    The third field is the time until a mode of PX4 itself flies, s.
     """
 
     act: Callable[[Px4, Process], Callable[[], object] | None]
@@ -73,7 +73,7 @@ def release(px4: Px4, _: Process) -> None:
 
 
 def override(px4: Px4, _: Process) -> Callable[[], object]:
-    """The stick says aux1 = 1 from 2 s on."""
+    """Move the stick to aux1 = 1 from 2 s on."""
     px4.say("param", "set", "COM_RC_IN_MODE", "1")
     stick = px4.tool("stick", "6", "2").wait_for("aux1 sent")
 
@@ -126,10 +126,10 @@ EVENTS = {
 def test_px4_flies_by_its_own_law_again(
     px4: Px4, name: str, record_testsuite_property: Callable[[str, object], None]
 ) -> None:
-    """Within the time of the event PX4 leaves offboard or is disarmed.
+    """Within the time of the event, PX4 leaves offboard or is disarmed.
 
-    The log says why the engagement ended. The time of a release and of an override begins with the
-    bridge's release in the log: their commands take longer to start.
+    The log says why the engagement ended. The time of a release or an override is measured from the
+    bridge's release in the log, because their commands take longer to start.
     """
     event = EVENTS[name]
     with ExitStack() as afterwards, engaged(px4, 90.0) as flight:
@@ -159,7 +159,7 @@ def test_px4_flies_by_its_own_law_again(
 def test_lost_transmitter_releases_within_a_second(
     px4: Px4, record_testsuite_property: Callable[[str, object], None]
 ) -> None:
-    """PX4 would fly on in offboard: COM_RCL_EXCEPT of the kit has the bit of offboard."""
+    """PX4 would fly on in offboard, because COM_RCL_EXCEPT of the kit has the bit of offboard."""
     px4.say("param", "set", "COM_RC_IN_MODE", "1")
     stick = px4.tool("stick", "600", "600")
     try:
@@ -181,7 +181,7 @@ def test_lost_transmitter_releases_within_a_second(
 
 
 def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
-    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale.
+    """With four busy processes per core for 3 s, the bridge stays engaged or says what was stale.
 
     PX4 flies in Hold then.
     """
@@ -201,9 +201,9 @@ def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
 
 @pytest.mark.parametrize("what", ["agent", "autopilot"])
 def test_the_stack_engages_again_after_a_restart(px4: Px4, what: str) -> None:
-    """One flight of the stack goes on.
+    """The same flight of the stack goes on.
 
-    PX4's client connects again where it has noticed that the agent was away.
+    PX4's client connects again if it has noticed that the agent was away.
     """
     with engaged(px4, 400.0) as flight:
         if what == "agent":

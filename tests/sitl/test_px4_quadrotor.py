@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map and the scenario of `examples/px4_quadrotor` against PX4's quadrotor.
+"""Test the map and the scenario of `examples/px4_quadrotor` against PX4's quadrotor.
 
-From Hold into offboard, commands, and back.
+It changes from Hold to offboard, follows commands, and changes back.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ SCENARIO = find_scenario(str(EXAMPLE / "scenario.yaml"))
 
 @pytest.fixture(scope="module")
 def quadrotor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Quadrotor]:
-    """PX4's quadrotor in hover.
+    """Yield PX4's quadrotor in hover.
 
     Without a stick it goes on, and without an offboard heartbeat it changes to Hold.
     """
@@ -34,9 +34,9 @@ def quadrotor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Quadrotor]:
 
 
 def test_quadrotor_follows_rates_and_vertical_speed(quadrotor: Quadrotor) -> None:
-    """The part of y that goes along with y_m has half to one and a half of its size.
+    """The part of y that follows y_m has half to one and a half of its size.
 
-    That holds as of the airplane; ticks replay.
+    The limits are those for the airplane, and the ticks replay.
     """
     channel_map = quadrotor.patient_map(str(EXAMPLE / "map.yaml"))
     with quadrotor.engaged(SCENARIO.path, channel_map, SCENARIO.flight.duration) as flight:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The examples of autopilots: airframe, scenario and map fit together.
+"""Test that airframe, scenario and map of each example of an autopilot fit together.
 
 docs/autopilots-reference.md says how they flew.
 """
@@ -32,7 +32,7 @@ LARGEST = {"q": 0.1, "V": 1.0, "p": 0.2, "r": 0.2, "vertical_speed": 1.0}
 def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """From any working folder."""
+    """The example can be flown from any working folder."""
     monkeypatch.chdir(tmp_path)
     scenario = find_scenario(str(REPOSITORY / "examples" / name / "scenario.yaml"), 15.0)
     autopilot = find_autopilot(EXAMPLES[name], dry_run=False)
@@ -51,7 +51,7 @@ def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(
 def test_copy_of_scenario_takes_the_airframe_beside(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A copy in a folder of its own flies the airframe of the sources, until one lies beside."""
+    """A copy in another folder flies the airframe of the sources, unless one lies beside it."""
     example = REPOSITORY / "examples" / "arduplane"
     copy = tmp_path / "mine" / "my_scenario.yaml"
     copy.parent.mkdir()
@@ -84,7 +84,7 @@ def test_identified_scenario_flies_under_guidance_where_map_has_a_pose(tmp_path:
 
 
 def test_limits_of_u_beyond_those_of_map_refused_before_flight_that_sends() -> None:
-    """The bridge would clip u, and the integrals of the law would go on."""
+    """The bridge would clip u, and the integrals of the law would continue."""
     scenario = find_scenario(str(REPOSITORY / "examples" / "px4_airplane" / "scenario.yaml"))
     wide = scenario.vary(controller={"upper": [0.13, 0.14, 0.13, 0.202]})
     with refusing(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The lock of a MAVLink link to one autopilot: by address, and by the time since boot."""
+"""Test the lock of a MAVLink link to one autopilot, by address and time since boot."""
 
 import pytest
 
@@ -13,13 +13,13 @@ FIRST, SECOND = "10.0.0.1:14550", "10.0.0.2:14550"
 
 
 class Sequence:
-    """A lock and the messages that it takes."""
+    """A lock and the messages that it accepts."""
 
     def __init__(self) -> None:
         self.lock = AutopilotLock(nanoseconds(SILENCE))
 
     def takes(self, now: float, since_boot: float | None, address: str = FIRST) -> bool:
-        """Take a message where the lock lets it pass.
+        """Take a message if the lock accepts it.
 
         Returns whether the autopilot is another one, or has started again.
         """
@@ -28,7 +28,7 @@ class Sequence:
         return self.lock.refresh(*message)
 
     def refuses(self, now: float, since_boot: float | None, address: str = FIRST) -> str:
-        """The sentence with which the lock refuses a message."""
+        """Return the sentence with which the lock refuses a message."""
         with pytest.raises(ChannelError) as error:
             self.takes(now, since_boot, address)
         assert error.value.reason == "sender"
@@ -61,7 +61,7 @@ def test_late_messages_of_one_clock_are_taken() -> None:
 def test_clock_that_drifts_stays_that_of_the_autopilot(drift: float) -> None:
     """A crystal drifts by less than 1e-4.
 
-    In an hour 1e-3 is 3.6 s, beyond the tolerance of a jump.
+    In an hour, 1e-3 is 3.6 s, which is more than the tolerance of a jump.
     """
     sequence = Sequence()
     sequence.takes(0.0, 100.0)

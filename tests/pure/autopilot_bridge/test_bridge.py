@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge without ROS: engagement, failsafe, pilot override, saturation, stamps.
+"""Test the bridge without ROS: engagement, failsafe, pilot override, saturation, stamps.
 
-The tests give the time.
+The tests set the time.
 """
 
 import signal
@@ -49,14 +49,14 @@ def receive_outputs(
 
 
 def receive_u(bridge: Bridge, t: float, u: float = 0.0, sender: str = "controller") -> None:
-    """As the receiver of the node."""
+    """Take a u as the receiver of the node does."""
     bridge.u_lock.check(sender, at(t))
     bridge.take_u(StampedVector(at(t), np.full(4, u), sender), at(t))
     bridge.u_lock.refresh(sender, at(t))
 
 
 def unlimited(name: str) -> ChannelMap:
-    """A map of the library without its limits of the pose."""
+    """Return a map of the library without its limits of the pose."""
     return load_map(name).model_copy(update={"envelope": {}, "engage_if": {}})
 
 
@@ -67,7 +67,7 @@ def new_bridge(channel_map: ChannelMap = CHANNEL_MAP, *, dry_run: bool = False) 
 def ready_bridge(
     u: float = 0.0, *, channel_map: ChannelMap = CHANNEL_MAP, dry_run: bool = False
 ) -> Bridge:
-    """A bridge that has received y and u at t = 0."""
+    """Return a bridge that has received y and u at t = 0."""
     bridge = new_bridge(channel_map, dry_run=dry_run)
     receive_outputs(bridge, 0.0)
     receive_u(bridge, 0.0, u)
@@ -325,14 +325,14 @@ PX4_STATUS = {"armed": 2.0, "offboard": 4.0, "transmitter": 1.0}
 
 
 def px4_bridge(t: float = 0.0, **status: float) -> Bridge:
-    """A bridge with the map of PX4 in Hold that has received y and u."""
+    """Return a bridge with the map of PX4 in Hold that has received y and u."""
     bridge = new_bridge(unlimited("px4"))
     refresh(bridge, t, **status)
     return bridge
 
 
 def refresh(bridge: Bridge, t: float, **status: float) -> None:
-    """Fresh y, u and conditions."""
+    """Send a new y, u and conditions."""
     receive_outputs(bridge, t, tuple(bridge.outputs), 20.0 if t == 0.0 else 21.0)
     receive_u(bridge, t)
     for name, raw in (PX4_STATUS | status).items():
@@ -430,7 +430,7 @@ def test_condition_that_is_not_reported_any_more_ends_engagement() -> None:
 
 
 def fly(bridge: Bridge, begin: float, end: float, **status: float) -> Phase:
-    """Fresh inputs ten times a second, and the phase at the end.
+    """Send inputs ten times a second, and return the phase at the end.
 
     A status of NaN is not received.
     """
@@ -525,7 +525,7 @@ STICKS = {"elevator": 1400.0, "thrust": 1450.0, "aileron": 1520.0, "rudder": 149
 
 
 def ardupilot_bridge(t: float = 0.0, sticks: dict[str, float] = STICKS) -> Bridge:
-    """A bridge with the map of ArduPilot in MANUAL, with the sticks in these positions."""
+    """Return a bridge with the map of ArduPilot in MANUAL, with the sticks in these positions."""
     bridge = new_bridge(unlimited("ardupilot"))
     receive_outputs(bridge, t, tuple(bridge.outputs))
     receive_u(bridge, t)
@@ -537,7 +537,7 @@ def ardupilot_bridge(t: float = 0.0, sticks: dict[str, float] = STICKS) -> Bridg
 
 
 def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
-    """-1 to 1 over 1000 to 2000 us, 30 deg and half of the throttle at 1."""
+    """-1 to 1 is 1000 to 2000 us, and at 1 there are 30 deg and half of the throttle."""
     bridge = ardupilot_bridge()
     engage(bridge)
     for name in STICKS:
@@ -572,7 +572,7 @@ def test_ardupilot_is_not_engaged_while_pilots_switch_is_on() -> None:
 
 
 def mavlink_bridge(override_time: float = 0.5, max_engaged: float = 120.0) -> Bridge:
-    """A bridge with the map of ArduPilot over MAVLink, ready in MANUAL.
+    """Return a bridge with the map of ArduPilot over MAVLink, ready in MANUAL.
 
     The parameter RC_OVERRIDE_TIME is in s.
     """
@@ -587,7 +587,7 @@ def mavlink_bridge(override_time: float = 0.5, max_engaged: float = 120.0) -> Br
 
 
 def receive_mavlink(bridge: Bridge, t: float) -> None:
-    """y, u and the conditions of the map of ArduPilot over MAVLink.
+    """Receive y, u and the conditions of the map of ArduPilot over MAVLink.
 
     The aircraft is in MANUAL, armed and in the air.
     """
@@ -605,7 +605,7 @@ def engaged_mavlink_bridge(max_engaged: float = 120.0) -> Bridge:
 
 
 def stop(bridge: Bridge, how: str) -> None:
-    """End an engagement as no pilot does."""
+    """End an engagement in a way in which no pilot does."""
     if how == "y ends":
         receive_u(bridge, 0.25)
     elif how == "u ends":
@@ -667,7 +667,7 @@ def test_pilot_who_takes_over_during_a_release_keeps_the_mode() -> None:
 
 
 def with_failsafe() -> Bridge:
-    """A bridge with the map of PX4 whose request for Hold is not sent after a pilot's release."""
+    """Return a bridge with PX4's map that does not request Hold after a pilot's release."""
     content = unlimited("px4").model_dump()
     content["messages"]["leave"]["when"] = "failsafe"
     return new_bridge(ChannelMap.validate_mapping(content, "map"))
@@ -690,9 +690,9 @@ def test_mode_is_asked_for_after_each_engagement_and_not_after_one_that_did_not_
 
 
 def test_lost_transmitter_asks_for_the_mode() -> None:
-    """A condition that does not hold is a choice of the pilot or the autopilot.
+    """A condition that is not met is a choice of the pilot or the autopilot.
 
-    The loss of the transmitter is none.
+    The loss of the transmitter is not.
     """
     bridge = with_failsafe()
     refresh(bridge, 0.0, offboard=14.0)
@@ -813,7 +813,7 @@ ENVELOPE = {"phi": [-0.8, 0.8], "theta": [-0.4, 0.5], "V": [-5.0, 8.0]}
 
 
 def enveloped_bridge() -> Bridge:
-    """An engaged bridge with ENVELOPE in level flight at trim speed."""
+    """Return an engaged bridge with ENVELOPE in level flight at trim speed."""
     bridge = new_bridge(
         ChannelMap.validate_mapping(CHANNEL_MAP.model_dump() | {"envelope": ENVELOPE}, "map")
     )
@@ -946,9 +946,9 @@ def followed(
     engaged_for: float = np.inf,
     must_begin: bool = False,
 ) -> Outcome:
-    """The outcome of a flight of osprey_gust, 60 s.
+    """Return the outcome of a flight of osprey_gust, 60 s.
 
-    It is flown with an autopilot, or else with an aircraft that begins it.
+    It is flown with an autopilot, or with an aircraft that must begin to fly.
     """
     scenario = find_scenario("osprey_gust")
     monotonic_ns = lambda: round(1e9 * vars(flying)["time"].monotonic())  # noqa: E731 - a stand-in
@@ -973,9 +973,9 @@ def followed(
 def test_flight_ends_once_log_holds_it(
     must_begin: bool, until: float | None, end: float, outcome: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A log that stops is waited for for 5 s.
+    """A flight waits 5 s for a log that has stopped.
 
-    With an autopilot (not `must_begin`) u may end, or never begin.
+    With an autopilot (not `must_begin`), u may end or never begin.
     """
     now = [0.0]
 
@@ -1102,7 +1102,7 @@ def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatc
 def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
     """`subprocess` releases a lock in a `finally`.
 
-    A lock that stays locked made a flight wait for its nodes without end.
+    A lock that stayed locked had made a flight wait for its nodes without end.
     """
     before = signal.getsignal(signal.SIGINT)
     clean = False
@@ -1117,7 +1117,7 @@ def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
 
 
 def test_signal_in_a_callback_of_a_module_in_c_waits_for_the_next_pause() -> None:
-    """pybind11 made a TypeError of the KeyboardInterrupt in a message that rclpy made."""
+    """In a message that rclpy made, pybind11 had turned the KeyboardInterrupt into a TypeError."""
 
     def interrupted_key(value: int) -> int:
         signal.raise_signal(signal.SIGINT)

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channel maps: each row of each map against hand-worked values.
+"""Test channel maps: each row of each map against values by hand.
 
-The conversion and the refusals of invalid maps are tested too. Plain objects with the published
+The conversion and the refusals of invalid maps are tested, too. Plain objects with the published
 fields (tests/published_messages.py) replace the messages, because px4_msgs may not be installed.
-Tests with real messages: tests/nodes/autopilot_bridge/test_bridge.py and
-test_published_messages.py.
+tests/nodes/autopilot_bridge/test_bridge.py and test_published_messages.py test real messages.
 """
 
 import json
@@ -119,7 +118,7 @@ def test_each_input_sent_in_autopilots_unit_and_sign(name: str) -> None:
 
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
 def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> None:
-    """A float32 has 24 bits, so a value is kept to 1e-7 of its size.
+    """A float32 has 24 bits, so that a value is kept to 1e-7 of its size.
 
     An integer field rounds to half a unit.
     """
@@ -169,7 +168,7 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
 
 @pytest.mark.parametrize("name", MAPS)
 def test_each_input_of_map_states_own_trim_and_sign(name: str) -> None:
-    """A merged row would hand a changed trim or sign of the elevator to the other inputs."""
+    """A merged row would pass a changed trim or sign of the elevator to the other inputs."""
     inputs = MAP_FILES[name].read_text().split("\ninputs:\n")[1].split("\n\n")[0]
     assert [inputs.count(f"\n    {key}: ") for key in ("trim", "sign")] == 2 * [
         len(named_map(name).inputs)
@@ -285,7 +284,7 @@ def test_check_map_finds_field_that_row_cannot_use(
 
 
 def test_request_of_a_service_is_checked_against_the_sources_of_a_package(tmp_path: Path) -> None:
-    """The fields of the answer, below the line ---, do not count."""
+    """The fields of the answer, below the line ---, are not checked."""
     (tmp_path / "package.xml").write_text("<package><name>ardupilot_msgs</name></package>")
     for section in ("msg", "srv"):
         (tmp_path / section).mkdir()
@@ -302,7 +301,7 @@ def test_request_of_a_service_is_checked_against_the_sources_of_a_package(tmp_pa
 
 
 def test_service_is_requested_and_does_not_fly() -> None:
-    """Its answer takes a round trip: setpoints and heartbeats are messages."""
+    """The answer takes a round trip, so setpoints and heartbeats must be messages."""
     content = named_map("ardupilot").model_dump()
     assert [name for name, row in named_map("ardupilot").messages.items() if row.is_service] == [
         "mode_after"
@@ -326,7 +325,7 @@ def test_attitude_of_map_is_that_of_body_frd_in_ned(
 ) -> None:
     """The attitude is checked by SciPy's rotations.
 
-    PX4 publishes body FRD in NED, the others body FLU in ENU (REP 103).
+    PX4 publishes body FRD in NED, and the others body FLU in ENU (REP 103).
     """
     frd_in_ned = Rotation.from_euler("ZYX", [psi, theta, phi])
     channel_map = shipped(name)
@@ -384,7 +383,7 @@ def test_velocity_in_body_axes_of_odometry_is_turned_to_the_world(
 ) -> None:
     """Odometry has its twist in the body frame, FLU (nav_msgs, REP 103).
 
-    SciPy turns 4 m/s north, 3 east, 2 up into it.
+    SciPy turns 4 m/s north, 3 east and 2 up into this frame.
     """
     flu_in_enu = TURN_NED_ENU * Rotation.from_euler("ZYX", [psi, theta, phi]) * TURN_FLU_FRD
     x, y, z, w = (2.0 * flu_in_enu.as_quat()).tolist()  # a quaternion of any length

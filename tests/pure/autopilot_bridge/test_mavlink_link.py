@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The MAVLink link over UDP, against a peer that is made with pymavlink alone."""
+"""Test the MAVLink link over UDP with a peer that is made with pymavlink alone."""
 
 import hashlib
 import re
@@ -30,7 +30,7 @@ PATIENCE = 5.0  # s, a guard: what is awaited takes some ms
 
 
 class Peer:
-    """An autopilot's end of a link: it answers requests of rates, and grants at most 40 Hz."""
+    """An autopilot's end of a link. It answers requests for rates, and grants at most 40 Hz."""
 
     def __init__(
         self, port: int, system: int = 1, phrase: str = "", component: int = 1, kind: str = "udpout"
@@ -52,22 +52,22 @@ class Peer:
         self.requested: dict[int, float] = {}  # Hz by message
 
     def beat(self) -> None:
-        """A heartbeat, armed and in MANUAL."""
+        """Send a heartbeat, armed and in MANUAL."""
         time.sleep(0.01)
         self.connection.mav.heartbeat_send(mavlink.MAV_TYPE_FIXED_WING, 3, 128, 0, 4)
 
     def attitude(self, pitchspeed: float, since_boot: float) -> None:
-        """An ATTITUDE, rad/s, with the time since boot, s."""
+        """Send an ATTITUDE, rad/s, with the time since boot, s."""
         self.connection.mav.attitude_send(
             round(1e3 * since_boot), 0.0, 0.0, 0.0, 0.0, pitchspeed, 0.0
         )
 
     def received(self) -> list[Any]:
-        """All that has come and was not taken yet."""
+        """Return all messages that have arrived and were not taken yet."""
         return list(iter(self.connection.recv_msg, None))
 
     def answer(self) -> Any:
-        """The next message, after an answer where it is a request."""
+        """Return the next message, and answer it if it is a request."""
         message = self.connection.recv_match(blocking=True, timeout=0.05)
         if message is not None and message.get_type() == "COMMAND_LONG":
             self.requested[int(message.param1)] = 1e6 / message.param2
@@ -77,13 +77,13 @@ class Peer:
 
 
 class Ends(NamedTuple):
-    """Makes a link that listens on a free port, and peers of it."""
+    """A maker of links that listen on a free port, and of peers."""
 
     link: Callable[..., tuple[Link, int]]
     peer: Callable[..., Peer]
 
     def started(self, *names: str, **options: Any) -> Any:
-        """A link that receives, its port, and the queues of the messages of some names."""
+        """Return a link that receives, its port, and the queues of messages with some names."""
         made, port = self.link(**options)
         queues = [made.listen(name) for name in names]
         made.start()
@@ -125,7 +125,7 @@ def ends() -> Iterator[Ends]:
 
 @pytest.fixture
 def phrase(tmp_path: Path) -> str:
-    """The file of a passphrase."""
+    """Return the file of a passphrase."""
     (tmp_path / "passphrase").write_text("a phrase\n")
     return str(tmp_path / "passphrase")
 
@@ -134,7 +134,7 @@ BEAT = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_FIXED_WING, 3, 128, 0,
 
 
 def received(message: Any, system: int = 1, component: int = 1) -> Any:
-    """A message as it is decoded after its way over a link."""
+    """Return a message as it is decoded after it was sent over a link."""
     packed = message.pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=component))
     return mavlink.MAVLink(None).parse_char(packed)
 
@@ -153,7 +153,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def until(condition: Callable[[], object], each: Callable[[], object]) -> None:
-    """Call `each` until the condition holds."""
+    """Call `each` until the condition is true."""
     end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < end
@@ -221,7 +221,7 @@ def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) ->
 
 
 def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> None:
-    """One autopilot is flown, as on a topic.
+    """Only one autopilot is flown, as on a topic.
 
     Another one may be a second aircraft, or a program of this host.
     """
@@ -290,9 +290,9 @@ def test_conflict_of_second_sender_ends_after_its_last_message(
 
 
 def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends) -> None:
-    """Two autopilots with one number behind a router have one address.
+    """Two autopilots with one number behind a router have the same address.
 
-    They have times since boot of their own.
+    Their times since boot differ.
     """
     made, port, queue = ends.started("ATTITUDE")
     router = ends.peer(port)
@@ -312,9 +312,9 @@ def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends
 
 
 def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) -> None:
-    """A gimbal (component 154) and a companion computer (191) send an ATTITUDE of themselves too.
+    """A gimbal (component 154) and a companion computer (191) send an ATTITUDE of their own, too.
 
-    They send it on the link or beside it.
+    They send it on the link or next to it.
     """
     made, port, queue = ends.started("ATTITUDE")
     autopilot = ends.peer(port)
@@ -392,7 +392,7 @@ def test_other_bridge_is_conflict(ends: Ends) -> None:
 def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) -> None:
     """ArduPilot counts messages of its ground station for FS_GCS_ENABL.
 
-    A dry run, which sends none of the map, has none.
+    A dry run sends no message of the map, and so none as a ground station.
     """
     made, port = ends.started(parameters=("RC_OVERRIDE_TIME",), ATTITUDE=40.0)
     peer = ends.peer(port)
@@ -477,7 +477,7 @@ def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_m
 
 
 def test_denied_rate_that_comes_all_the_same_is_no_problem(ends: Ends, clock: Clock) -> None:
-    """A request of 50 Hz is denied, and the 40 Hz of an earlier one stay: 80 % of it."""
+    """A request for 50 Hz is denied, and the 40 Hz of an earlier one continue, which are 80 %."""
     made, _ = ends.link(ATTITUDE=50.0)
     attitude = received(mavlink.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
     made._take(attitude, SENDER, 0)
@@ -492,7 +492,10 @@ def test_denied_rate_that_comes_all_the_same_is_no_problem(ends: Ends, clock: Cl
 
 
 def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock: Clock) -> None:
-    """Overrides hide its silence from the autopilot. One that was never heard is not missed."""
+    """Overrides hide the station's silence from the autopilot.
+
+    A station that was never heard is not missed.
+    """
     made, _ = ends.link()
     made._take(received(BEAT), SENDER, 0)
     clock.now += 60.0
@@ -532,7 +535,7 @@ def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock:
 def test_numbers_of_ground_stations_are_those_of_the_autopilot(
     ends: Ends, clock: Clock, parameters: dict[str, float], dropped: str, watched: int
 ) -> None:
-    """The numbers are those from MAV_GCS_SYSID to MAV_GCS_SYSID_HI; before, SYSID_MYGCS.
+    """The numbers are MAV_GCS_SYSID to MAV_GCS_SYSID_HI, and in earlier versions SYSID_MYGCS.
 
     Source: ArduPilot, GCS.h, sysid_is_gcs. Overrides of another number have no effect. The bridge
     sends as 255.
@@ -631,7 +634,7 @@ def test_passphrase_holds_in_a_process_that_has_not_seen_mavlink_2(
 ) -> None:
     """A connection of pymavlink begins with MAVLink 1, which has no signatures.
 
-    It does not where an earlier connection has set this variable.
+    If an earlier connection has set this variable, it does not.
     """
     monkeypatch.delenv("MAVLINK20", raising=False)
     made, port, queue = ends.started("HEARTBEAT", passphrase_file=phrase)
@@ -650,7 +653,7 @@ def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.Monkey
 def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requested(
     name: str, key: str
 ) -> None:
-    """The numbers of the modes are those that pymavlink has of ArduPlane.
+    """The numbers of the modes are those that pymavlink has for ArduPlane.
 
     MAV_CMD are those of common.xml.
     """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rates of a link's messages: which are slow, and what follows.
+"""Test the rates of a link's messages: which are slow, and what follows.
 
-A slow rate is requested again, refuses and ends an engagement. The tests give the time.
+A slow rate is requested again, prevents an engagement, and ends one. The tests set the time.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ REQUESTED = {"ATTITUDE": 40.0, "EXTENDED_SYS_STATE": 2.0}
 
 
 class Stream:
-    """Messages whose intervals are even, and what is requested again, by the instant."""
+    """Messages with regular intervals, and what is requested again, by the instant."""
 
     def __init__(self) -> None:
         self.rates = MessageRates(REQUESTED, 0.0)
@@ -25,7 +25,7 @@ class Stream:
         self._due = dict.fromkeys(REQUESTED, 0.0)
 
     def run(self, until: float, **hz: float) -> "Stream":
-        """Run to an instant, with rates other than the requested ones."""
+        """Run to an instant, with rates that differ from the requested ones."""
         present = {**REQUESTED, **hz}
         for name, rate in present.items():
             self._due[name] = min(self._due[name], self.now + 1.0 / rate)
@@ -49,9 +49,9 @@ def test_rates_are_unknown_for_two_seconds_and_then_as_requested() -> None:
 
 
 def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagement() -> None:
-    """The request mends a rate that fell from 40 to 4 Hz.
+    """The new request restores a rate that fell from 40 to 4 Hz.
 
-    The count of 2 s is below 70 % after 2 s (1 - 0.7) / (1 - 0.1) = 0.67 s.
+    The count over 2 s is below 70 % after 2 s (1 - 0.7) / (1 - 0.1) = 0.67 s.
     """
     stream = Stream().run(10.0)
     stream.run(10.8, ATTITUDE=4.0)

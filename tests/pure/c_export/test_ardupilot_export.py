@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export --ardupilot`: the files compile beside a stub of ArduPlane's headers.
+"""Test `rise-di export --ardupilot`: the files compile with a stub of ArduPlane's headers.
 
-Each name that the shell takes from ArduPlane is in the stub.
+The stub has each name that the shell takes from ArduPlane.
 """
 
 import re
@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequ
 
 
 def test_compiles_beside_a_stub_of_arduplane(folder: Path, tmp_path: Path) -> None:
-    """In float also under the flag of ArduPilot that makes constants float."""
+    """The float version also compiles with ArduPilot's flag that makes constants float."""
     code = folder / SHELLS["ardupilot"].place
     stub = f"-I{REPOSITORY / 'tests' / 'ardupilot'}"
     shell = ["g++", "-std=gnu++17", *WARNINGS, "-Wno-unused-parameter", stub]
@@ -47,7 +47,7 @@ def test_compiles_beside_a_stub_of_arduplane(folder: Path, tmp_path: Path) -> No
 
 
 def flown(folder: Path, work: Path, *words: str) -> list[tuple[float, str]]:
-    """What the task tells in a flight on a host, with instants, under the traps of SITL."""
+    """Return what the task tells in a flight on a host, with instants, under the traps of SITL."""
     code = folder / SHELLS["ardupilot"].place
     stub = REPOSITORY / "tests" / "ardupilot"
     for name in ("rise_di", "rise_di_rates"):
@@ -65,9 +65,9 @@ def flown(folder: Path, work: Path, *words: str) -> list[tuple[float, str]]:
 
 
 def test_flies_under_the_floating_point_traps_of_sitl(folder: Path, tmp_path: Path) -> None:
-    """The self-test divides by 0 on purpose, at which ArduPlane's SITL ended in its first loop.
+    """The self-test divides by 0 on purpose, which had ended ArduPlane's SITL in its first loop.
 
-    The log has an instant of its own in each loop, while the spare flies too.
+    The log has an instant of its own in each loop, also while the spare flies.
     """
     instants, texts = zip(*flown(folder, tmp_path), strict=True)
     assert instants == approx((2.0, 4.0), abs=0.02)
@@ -81,7 +81,7 @@ def test_leaves_the_autotune_to_the_spare(folder: Path, tmp_path: Path) -> None:
 
 
 def test_says_what_the_switch_needs(folder: Path, tmp_path: Path) -> None:
-    """Without scripting ArduPlane refuses RCx_OPTION 300 and does not arm."""
+    """Without scripting, ArduPlane refuses RCx_OPTION 300 and does not arm."""
     code = folder / SHELLS["ardupilot"].place
     stub = f"-I{REPOSITORY / 'tests' / 'ardupilot'}"
     words = [
@@ -98,7 +98,7 @@ def test_says_what_the_switch_needs(folder: Path, tmp_path: Path) -> None:
 
 
 def test_refuses_a_yaw_rate_and_an_unknown_autopilot(tmp_path: Path) -> None:
-    """The rudder coordinates turns in ArduPlane: nothing there gives a yaw rate to follow."""
+    """In ArduPlane the rudder coordinates turns, so that there is no yaw rate to follow."""
     three = REPOSITORY / "examples" / "px4_airplane" / "rates.yaml"
     with refusing("controller.outputs: found q, p, r, expected some of p, q: ArduPlane"):
         write_module("ardupilot", find_scenario(str(three)), tmp_path, float32=True)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export`: C code beside the Python controller, bit by bit.
+"""Test `rise-di export`: C code against the Python controller, bit by bit.
 
-Further tests are of mutants of the C code, sanitizers and refusals.
+Further tests use mutants of the C code, sanitizers and refusals.
 """
 
 import ctypes
@@ -117,9 +117,9 @@ class Case(NamedTuple):
 
 
 def export_case(name: str, folder: Path) -> Case:
-    """Short flights at the rate of the controller, 1500 drawn calls, and 300 steps.
+    """Return short flights at the controller's rate, 1500 random calls and 300 steps.
 
-    The steps are with each parameter set; a tenth where Python allocates.
+    The steps are with each parameter set. If Python is slow, there are a tenth of them.
     """
     rate = SCENARIOS[name]().controller.rate
     slow = {"rate": rate, "step": min(0.005, 1.0 / rate)}
@@ -147,9 +147,9 @@ def export_case(name: str, folder: Path) -> Case:
 
 
 def any_numbers(sets: list[RiseDiConfig]) -> Recording:
-    """Ticks of the guard with y and y_m of any size, infinite and NaN too.
+    """Return ticks of the guard with y and y_m of any size, also infinite and NaN.
 
-    The stamps go up to both ends of int64.
+    The stamps reach both ends of int64.
     """
     rng = np.random.default_rng(5)
     recorder = Recorder(sets)
@@ -175,7 +175,7 @@ def any_numbers(sets: list[RiseDiConfig]) -> Recording:
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Case]:
-    """The case of a scenario, made once."""
+    """Return the case of a scenario, which is made once."""
     return cache(lambda name: export_case(name, tmp_path_factory.mktemp("code")))
 
 
@@ -237,7 +237,7 @@ def test_bits_do_not_depend_on_optimisation(
 def test_contraction_does_not_start(exported: Callable[[str], Case], tmp_path: Path) -> None:
     """A fused multiply-add has a single rounding.
 
-    Without -ffp-contract=off nothing flies where the processor has it.
+    Without -ffp-contract=off, the code does not start on a processor that has it.
     """
     if " fma " not in Path("/proc/cpuinfo").read_text():
         pytest.skip("no fused multiply-add on this processor")
@@ -274,7 +274,7 @@ FUNCTION = re.compile(
 
 
 def bodies(source: str) -> dict[str, tuple[int, int]]:
-    """Begin and end of each function."""
+    """Return the beginning and the end of each function."""
     return {match[1]: match.span() for match in FUNCTION.finditer(source)}
 
 
@@ -287,9 +287,9 @@ __attribute__((constructor)) static void choose(void) { mutant = atoi(getenv("MU
 
 
 def with_mutants(source: str) -> str:
-    """The code with a mutant of each function beside it: MUTANT is the number of the one in use.
+    """Return the code with a mutant of each function. MUTANT is the number of the one in use.
 
-    All are in one program, because it takes longer to compile than to run.
+    All are in one program, because compiling takes longer than running.
     """
     places = bodies(source)
     assert set(places) == set(MUTANTS)
@@ -328,7 +328,7 @@ def test_proof_finds_a_mutant_of_each_function(
 
 
 def is_found(program: Program, recordings: list[Recording]) -> bool:
-    """Whether the proof tells a mutant from the code."""
+    """Return whether the proof distinguishes a mutant from the code."""
     with suppress(ParameterError):  # rise_di_start refuses what is not computed as written
         return any(program.compare(recording).differing for recording in recordings)
     return True
@@ -340,7 +340,7 @@ def test_check_names_an_edit_out_of_bounds(
 ) -> None:
     """Each set of the proof passes, and each value out of bounds is named.
 
-    That is each real beyond each of its finite bounds, each NaN and each odd integer.
+    The values are each real number beyond each of its finite bounds, each NaN and each odd integer.
     """
     case = exported(name)
     build(
@@ -427,7 +427,7 @@ def test_float32_is_within_its_bound(exported: Callable[[str], Case], tmp_path: 
 
 
 def export(scenario: str, folder: Path, **words: Any) -> None:
-    """`rise-di export`."""
+    """Run `rise-di export`."""
     Export(scenario=scenario, folder=folder, **words).execute()
 
 
@@ -518,9 +518,9 @@ def test_refusals_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_proof_of_a_log_takes_changes_of_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """New gains in flight are an event of the recording, and every u is that of the log.
+    """New gains in flight are an event of the recording, and every u is the one of the log.
 
-    Without the changes it is refused.
+    Without the changes, the log is refused.
     """
     scenario = find_scenario("osprey_servo", 2.0)
     change = {"k_g": 2.0}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wrappers of the exported code.
+"""Test wrappers of the exported code.
 
 They are the library that replays logs, a caller of a library at 250 Hz, and the unit of FMI 2.0.
 """
@@ -68,7 +68,10 @@ def test_library_replays_a_log(
 
 
 class Call(NamedTuple):
-    """An instant of a caller, and the samples that have arrived since the last: stamp, value."""
+    """An instant of a caller, and the samples that have arrived since the last instant.
+
+    A sample has a stamp and a value.
+    """
 
     now_ns: int
     y: list[tuple[int, FloatArray]]
@@ -76,9 +79,9 @@ class Call(NamedTuple):
 
 
 def jittering_calls(count: int, seed: int) -> list[Call]:
-    """Calls at 250 Hz, late by up to a quarter of a period.
+    """Return calls at 250 Hz that are late by up to a quarter of a period.
 
-    A fifth of y and a tenth of y_m are lost; a second is without y.
+    A fifth of y and a tenth of y_m are lost, and there is one second without y.
     """
     rng = np.random.default_rng(seed)
     calls = []
@@ -98,7 +101,7 @@ def jittering_calls(count: int, seed: int) -> list[Call]:
 
 @pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer"])
 def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CController]) -> None:
-    """The caller of the page on export, with jitter and lost samples.
+    """The caller from the page on export has jitter and lost samples.
 
     u and mode are those of the Python controller.
     """
@@ -144,7 +147,7 @@ def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def flown(unit: Path, tape: Tape, outputs: Sequence[str], **start: float) -> FloatArray:
-    """The u of a unit along y and y_m of a tape, by FMPy, with other parameters."""
+    """Return the u of a unit along y and y_m of a tape, by FMPy, with other parameters."""
     fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: pip install fmpy")
     t = tape.time("internals")
     columns = {
@@ -173,8 +176,8 @@ def flown(unit: Path, tape: Tape, outputs: Sequence[str], **start: float) -> Flo
 def test_fmu_flies_to_the_bit(unit: Path, tmp_path: Path) -> None:
     """FMPy, an independent host of FMI, steps the unit with y and y_m of a flight.
 
-    The flight is in one process. A gain set before the flight is that of Python, and the sources
-    compile by CMake.
+    The flight is in one process. A gain that is set before the flight is the one in Python, and the
+    sources compile with CMake.
     """
     scenario = find_scenario("osprey_observer", 5.0).vary(
         aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
@@ -296,9 +299,9 @@ int main(void) {
 
 @pytest.fixture(scope="module")
 def code(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The code of osprey_observer, and a program that starts it.
+    """Return the code of osprey_observer, and a program that starts it.
 
-    It has a feedforward and so the sine.
+    It has a feedforward, and so the sine.
     """
     folder = tmp_path_factory.mktemp("code")
     write_code(
@@ -312,9 +315,9 @@ def code(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def started(code: Path, compiler: Sequence[str], flags: Sequence[str]) -> int:
-    """Exit status of the program: 0 where the controller starts.
+    """Return the exit status of the program, which is 0 if the controller starts.
 
-    It is 1 where it does not and then refuses every call.
+    It is 1 if the controller does not start, and then refuses every call.
     """
     build([*compiler, *FLAGS, *flags, "-o", "starter", "starter.c", "rise_di.c"], code)
     return subprocess.run(["./starter"], cwd=code, check=False).returncode
@@ -324,9 +327,9 @@ def started(code: Path, compiler: Sequence[str], flags: Sequence[str]) -> int:
     "flags", ["-O1 -ffast-math", *(f"-O3 {flags}" for flags in (FAST_MATH[0], *FAST_MATH[2:6]))]
 )
 def test_controller_does_not_start_under_flags_that_change_bits(flags: str, code: Path) -> None:
-    """Where no macro tells of them, the test of rise_di_start does, in the fastest code too.
+    """If no macro shows the flags, the test in rise_di_start does, also in the fastest code.
 
-    0.3 is not rounded to 0 then.
+    Then 0.3 is not rounded to 0.
     """
     assert started(code, ["gcc"], [*flags.split(), *WITHOUT_MACROS]) == 1
 
@@ -343,9 +346,9 @@ HAS_FMA = CPU.is_file() and " fma " in CPU.read_text()
 
 
 def test_twelve_of_twelve_wrong_flags_are_refused(code: Path) -> None:
-    """The compiler refuses them, or rise_di_start.
+    """The compiler or rise_di_start refuses them.
 
-    The last needs a processor with a fused multiply-add.
+    The last one needs a processor with a fused multiply-add.
     """
 
     def is_refused(flags: str) -> bool:
@@ -360,7 +363,7 @@ def test_twelve_of_twelve_wrong_flags_are_refused(code: Path) -> None:
 
 
 def test_calls_before_the_start_are_refused(code: Path) -> None:
-    """In memory of zeros, as of a static controller."""
+    """The memory is zero, as for a static controller."""
     (code / "early.c").write_text(
         STARTER.replace("rise_di_start(&controller, &parameters)", "(int)parameters.sign < 0")
     )
@@ -375,7 +378,7 @@ def test_wrong_samples_are_lost_as_by_controller(
 ) -> None:
     """The same samples are lost, and u has the same bits.
 
-    They are a spike, a jump that stays, noise that grows, and y_m beyond its bound.
+    The samples are a spike, a jump that stays, noise that grows, and a y_m beyond its bound.
     """
     config = exportable(find_scenario("osprey_observer").controller)
     rng = np.random.default_rng(4)
@@ -411,7 +414,7 @@ def test_wrong_samples_are_lost_as_by_controller(
 
 
 def test_export_at_another_rate_is_the_loop_at_that_rate(tmp_path: Path) -> None:
-    """Of two periods Phi is Phi^2; a rate at which the loop is unstable is refused."""
+    """For a period twice as long, Phi is Phi^2. A rate at which the loop is unstable is refused."""
     scenario = find_scenario("osprey_observer")
     controller = scenario.rise_di()
     nominal = controller.nominal()
@@ -443,9 +446,10 @@ int main() { return std::fwrite(&parameters, sizeof parameters, 1, stdout) == 1 
 
 @pytest.mark.parametrize("float32", [False, True])
 def test_constants_are_those_of_python_in_strict_cpp_14(tmp_path: Path, *, float32: bool) -> None:
-    """Decimal digits, as C++ before 17 has no hexadecimal ones, are read to the same bits.
+    """Decimal digits give the same bits, because C++ before 17 has no hexadecimal ones.
 
-    The gains are drawn over many powers of two: each number of a struct has other last bits.
+    The gains are drawn over many powers of two, so that each number of a struct has other last
+    bits.
     """
     rng = np.random.default_rng(8)
     scenario = find_scenario("osprey_observer")

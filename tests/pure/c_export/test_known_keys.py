@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The C code is a second controller: it knows the keys whose constants it holds."""
+"""Test the keys of the C code, which is a second controller and has their constants."""
 
 import pytest
 from tests.conftest import refusing
@@ -18,7 +18,7 @@ BEYOND_C = {
 
 
 def test_every_key_is_in_one_set() -> None:
-    """A new key is in the C code, needs none of it, or is refused."""
+    """A new key is in the C code, is not needed there, or is refused."""
     assert sorted([*IN_C, *IDLE_IN_C, *BEYOND_C]) == sorted(keys_of(RiseDiConfig))
 
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export --px4`: what the module decides, in a host build without PX4.
+"""Test `rise-di export --px4`: what the module decides, in a host build without PX4.
 
-Its C++ compiles beside a stub of PX4's headers.
+Its C++ is compiled with a stub of PX4's headers.
 """
 
 import ctypes
@@ -102,7 +102,7 @@ int host_run(rise_di_rates *rates, const rise_di_cycle *cycle, float *torque, do
 
 
 class Shell:
-    """The decisions of the module, with a clock of its own: a cycle a period."""
+    """The decisions of the module, with a clock of its own and one cycle per period."""
 
     def __init__(self, library: Path) -> None:
         self._library = ctypes.CDLL(str(library))
@@ -117,7 +117,10 @@ class Shell:
         self.fly(MEASURING, enabled=False)
 
     def run(self, **changes: object) -> int:
-        """A cycle in which everything is as RISE-DI needs it, less `changes`; the refusal."""
+        """Run a cycle in which RISE-DI has all it needs, except for `changes`.
+
+        Return the refusal.
+        """
         self.now_us += self.period_us
         stamps = dict.fromkeys(("rates_us", "setpoint_us", "spare_us"), self.now_us)
         switches = dict.fromkeys(("enabled", "armed", "has_rates"), True)
@@ -139,13 +142,13 @@ class Shell:
         return int(self._library.host_run(self._memory, ctypes.byref(cycle), *pointers))
 
     def fly(self, cycles: int, **changes: object) -> list[int]:
-        """The refusals of some cycles."""
+        """Return the refusals of some cycles."""
         return [self.run(**changes) for _ in range(cycles)]
 
 
 @pytest.fixture(scope="module", params=[OBSERVER, RATES], ids=["double", "float"])
 def folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
-    """The module with an observer, whose u_o has limits too, in double; without one in float."""
+    """Return the module with an observer and limits of u_o in double, or without one in float."""
     folder = tmp_path_factory.mktemp("px4")
     write_module("px4", find_scenario(str(request.param)), folder, float32=request.param == RATES)
     return folder
@@ -178,7 +181,7 @@ def shell(library: Path) -> Shell:
 
 
 def test_spare_flies_until_all_is_ready(shell: Shell) -> None:
-    """Its torque goes through in the same cycle, to the bit."""
+    """The torque of the spare passes through in the same cycle, to the bit."""
     for changes, refusal in (
         ({"enabled": False}, OFF),
         ({"armed": False}, NOT_ARMED),
@@ -217,7 +220,7 @@ def test_takes_over_from_the_torque_of_the_spare(shell: Shell) -> None:
 def test_falls_back_in_the_same_cycle(
     shell: Shell, changes: dict[str, object], refusal: int, latches: bool
 ) -> None:
-    """The difference then fades; a fault stays until RISE-DI is switched off."""
+    """The difference then fades. A fault stays until RISE-DI is switched off."""
     shell.fly(100, enabled=False)
     assert set(shell.fly(50, setpoint=(0.3, 0.2, 0.1))) == {FLIES}
     before = shell.torque.copy()
@@ -232,9 +235,9 @@ def test_falls_back_in_the_same_cycle(
 
 
 def test_samples_that_stop_are_told_by_their_age(shell: Shell) -> None:
-    """The cycle goes on without samples.
+    """The cycles continue without samples.
 
-    The spare flies once they are older than the limit of 0.02 s.
+    The spare flies when the samples are older than the limit of 0.02 s.
     """
     shell.fly(20)
     stamp_us = shell.now_us
@@ -243,18 +246,18 @@ def test_samples_that_stop_are_told_by_their_age(shell: Shell) -> None:
 
 
 def test_y_is_of_the_instant_before_the_filters_of_the_rates(shell: Shell) -> None:
-    """By their delay y_m of that instant is compared.
+    """The delay of the filters is taken into account when y is compared with y_m.
 
-    So the rates, not what the filters leave of them, follow the reference.
+    So the rates themselves follow the reference, and not what the filters leave of them.
     """
     shell.fly(20, filter_us=5600)
     assert shell.values[20] == shell.now_us - 5600
 
 
 def test_reference_follows_the_setpoint(shell: Shell) -> None:
-    """y_m is that of Python at the instants of the periods, for any rates that come faster.
+    """y_m is the one in Python at the instants of the periods, for any faster rates.
 
-    A pause starts it again.
+    After a pause it starts again.
     """
     shell.fly(300, setpoint=(0.3, -0.2, 0.1), rates=(0.3, -0.2, 0.1), enabled=False)
     assert shell.values[:3] == approx([-0.2, 0.3, 0.1], abs=1e-3)  # q, p, r
@@ -265,7 +268,7 @@ def test_reference_follows_the_setpoint(shell: Shell) -> None:
 
 
 def test_torque_follows_the_dynamic_pressure(library: Path) -> None:
-    """The same error at twice the airspeed has a quarter of the torque.
+    """At twice the airspeed, the same error gives a quarter of the torque.
 
     Without an airspeed there is no scale.
     """
@@ -284,7 +287,7 @@ def test_torque_follows_the_dynamic_pressure(library: Path) -> None:
 
 
 def test_limits_are_those_of_the_torque(library: Path) -> None:
-    """In slow flight the torque of 1 comes at a smaller u.
+    """In slow flight, a torque of 1 is reached at a smaller u.
 
     The law stops there and does not wind up.
     """
@@ -342,7 +345,7 @@ def test_bounds_of_the_parameters_are_those_that_the_module_keeps(folder: Path) 
 
 
 def quadrotor(folder: Path, **changes: str) -> Scenario:
-    """Rates of a multicopter: those of the airplane, with torques about the axes as inputs."""
+    """Return rates of a multicopter: the airplane's, with torques about the axes as inputs."""
     inputs = {"elevator": "pitch", "aileron": "roll", "rudder": "yaw"} | changes
     airframe = "name: quad\nsource: made up\nstates: {q: rad/s, p: rad/s, r: rad/s}\ninputs:\n"
     for name, effect in zip(inputs.values(), ("nose up", "roll right", "nose right"), strict=True):
@@ -360,7 +363,7 @@ def quadrotor(folder: Path, **changes: str) -> Scenario:
 
 
 def test_spare_is_that_of_the_vehicle(tmp_path: Path) -> None:
-    """A multicopter has no trim speed, and torques as inputs: mc_rate_control is its spare."""
+    """A multicopter has no trim speed and torques as inputs. Its spare is mc_rate_control."""
     words = {"fixed": ("fw_rate_control", "virtual_fw"), "quad": ("mc_rate_control", "virtual_mc")}
     scenarios = {"fixed": find_scenario(str(RATES)), "quad": quadrotor(tmp_path)}
     for (name, expected), absent in zip(words.items(), reversed(words.values()), strict=True):
@@ -387,7 +390,7 @@ def test_vehicle_that_is_neither_is_refused(tmp_path: Path) -> None:
 
 
 def test_flight_needs_no_more_samples_than_the_module_keeps(folder: Path) -> None:
-    """The u of a flight is that with the 100 samples of the stack."""
+    """The u of the flight is the same as with the 100 samples of the stack."""
     assert f"RISE_DI_SAMPLES {SAMPLES} " in (folder / MODULE / PARAMETERS).read_text("utf-8")
     flight = find_scenario(str(RATES), 4.0)
     sets = [exportable(flight.controller)]
@@ -417,10 +420,10 @@ def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
 
 
 def flown_table(shell: Shell, controller: ControllerConfig) -> MessageTable:
-    """rise_di_status of a flight.
+    """Return rise_di_status of a flight.
 
-    The rates come at twice the rate of the law with jitter, slow and fast, with a hand-back of 0.2
-    s.
+    The rates come at twice the rate of the law, with jitter, slow and fast, and with a hand-back of
+    0.2 s.
     """
     rng = np.random.default_rng(7)
     shell.period_us = PERIOD_US // 2
@@ -460,7 +463,8 @@ def flown_table(shell: Shell, controller: ControllerConfig) -> MessageTable:
 def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> None:
     """Python computes the u of each tick from rise_di_status alone.
 
-    It takes the y, y_m and limits. After a gap of the log it begins again with the next engagement.
+    It takes y, y_m and the limits from it. After a gap in the log, it begins again with the next
+    engagement.
     """
     controller = find_scenario(str(OBSERVER)).controller
     table = flown_table(shell, controller)

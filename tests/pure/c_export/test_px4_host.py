@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The module RiseDiControl.cpp runs on a host: tests/px4 has topics and parameters of PX4.
+"""Test the module RiseDiControl.cpp on a host, where tests/px4 has topics and parameters of PX4.
 
-A flight of 8 s at 250 Hz, RDI_EN 1 from 2 s on, with an event. What the module publishes and tells.
+A flight lasts 8 s at 250 Hz, with RDI_EN 1 from 2 s on and with an event. The tests check what the
+module publishes and tells.
 """
 
 import re
@@ -40,7 +41,7 @@ class Flown(NamedTuple):
 
 
 def compiled(module: Path, host: str) -> None:
-    """The module with its host as the program `module`."""
+    """Compile the module with its host as the program `module`."""
     source = (module / "RiseDiControl.cpp").read_text("utf-8")
     for header in re.findall(r"#include <(.*)>", source):
         path = module / "px4" / header
@@ -85,7 +86,7 @@ def program(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def flown(program: Path, *words: str) -> Flown:
-    """A flight with an event. A finding of a sanitizer ends it."""
+    """Run a flight with an event. A finding of a sanitizer ends it."""
     environment = {"ASAN_OPTIONS": "detect_leaks=0"}  # the module lives to the end, as in PX4
     done = subprocess.run(
         [str(program), *words],
@@ -114,7 +115,7 @@ def flown(program: Path, *words: str) -> Flown:
 
 
 def texts(flight: Flown, word: str) -> list[float]:
-    """The instants at which a text with a word was told."""
+    """Return the instants at which a text with a word was told."""
     return [instant for instant, text in flight.told if word in text]
 
 
@@ -128,14 +129,14 @@ def test_takes_over_and_hands_on_the_thrust(program: Path) -> None:
 
 
 def test_hands_on_the_spare_in_the_cycle_of_its_rates(program: Path) -> None:
-    """In SIH a tenth of the torques of mc_rate_control came behind the rates: a period late."""
+    """In SIH, a tenth of the torques of mc_rate_control came after the rates, a period late."""
     flight = flown(program, "behind")
     assert flight.published == CYCLES
     assert texts(flight, "late torque") == []
 
 
 def test_publishes_nothing_where_the_spare_never_did(program: Path) -> None:
-    """Another controller may publish the same topics: extras.txt was forgotten."""
+    """Another controller may publish the same topics, if extras.txt was forgotten."""
     flight = flown(program, "never")
     assert flight.published == 0
     assert texts(flight, "the spare does not publish")[0] == approx(2.0, abs=0.01)
@@ -164,7 +165,7 @@ def test_falls_back_and_tells(program: Path, event: str, text: str, instant: flo
 
 
 def test_setting_that_was_wrong_before_is_told_at_the_switch(program: Path) -> None:
-    """PX4's SIH at 200 Hz: the refusal stood before RDI_EN was 1, and nothing was told."""
+    """At 200 Hz in PX4's SIH, the refusal was there before RDI_EN was 1, and was not told."""
     flight = flown(program, "age", "1")
     text = "RISE-DI does not fly: maximum age not within 0.01 to 1 s"
     assert texts(flight, text) == [approx(2.0, abs=0.01)]

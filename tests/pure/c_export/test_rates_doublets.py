@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Doublets of the scenarios for PX4's airplane, beside a rate controller of PX4's form.
+"""Test doublets of the scenarios for PX4's airplane against a rate controller in PX4's form.
 
-The aircraft has the bank too: gravity along a banked wing moves the sideslip, beta_dot += g/V0 phi,
-which the airframe of the rates does not know, but the feedforward of rates.yaml does. The air is
-calm, and the gyro has the noise of PX4's simulator.
+The aircraft has the bank, too. Gravity along a banked wing moves the sideslip, beta_dot += g/V0
+phi, which the airframe of the rates does not know, but the feedforward of rates.yaml does. The air
+is calm, and the gyro has the noise of PX4's simulator.
 """
 
 import csv
@@ -51,7 +51,7 @@ Rows = NDArray[np.float64]
 
 
 def with_bank() -> dict[str, object]:
-    """The airframe of the rates with the state phi."""
+    """Return the airframe of the rates with the state phi."""
     airframe = yaml.safe_load((EXAMPLE / "rates_airframe.yaml").read_text("utf-8"))
     states = [*airframe["states"], "phi"]
     A = np.zeros((6, 6))
@@ -72,7 +72,7 @@ def airframe(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rms(t: Rows, e: Rows) -> dict[str, Rows]:
-    """Rms of each axis in each doublet, mrad/s, in the order of AXES."""
+    """Return the rms of each axis in each doublet, mrad/s, in the order of AXES."""
     return {
         name: 1e3 * np.sqrt(np.mean(e[(t >= start) & (t < stop)] ** 2, axis=0))
         for name, (start, stop) in WINDOWS.items()
@@ -80,7 +80,7 @@ def rms(t: Rows, e: Rows) -> dict[str, Rows]:
 
 
 def flown(name: str, airframe: Path) -> tuple[dict[str, Rows], Rows, Rows]:
-    """The errors of a scenario of the example in the doublets, and t and y_m."""
+    """Return the errors of a scenario of the example in the doublets, and t and y_m."""
     scenario: Scenario = find_scenario(str(EXAMPLE / name)).vary(
         flight={"duration": 11.0},
         aircraft={"airframe": str(airframe), "sensors": {"noise": NOISE.tolist()}},
@@ -95,7 +95,7 @@ def flown(name: str, airframe: Path) -> tuple[dict[str, Rows], Rows, Rows]:
 
 
 def flown_by_px4(airframe: Path, t: Rows, y_m: Rows) -> dict[str, Rows]:
-    """The errors of the rate loop of PX4 with y_m as the setpoint; y is 4 ms late."""
+    """Return the errors of PX4's rate loop with y_m as the setpoint and a y that is 4 ms late."""
     scenario = find_scenario(str(EXAMPLE / "rates.yaml"))
     loop = own_loop(PARAMETERS, scenario, "px4")
     assert loop is not None
@@ -108,16 +108,17 @@ def flown_by_px4(airframe: Path, t: Rows, y_m: Rows) -> dict[str, Rows]:
 
 @pytest.fixture(scope="module")
 def errors(airframe: Path) -> dict[str, dict[str, Rows]]:
-    """The errors by controller."""
+    """Return the errors by controller."""
     by_law, t, y_m = flown("rates.yaml", airframe)
     with_observer, _, _ = flown("rates_observer.yaml", airframe)
     return {"law": by_law, "observer": with_observer, "px4": flown_by_px4(airframe, t, y_m)}
 
 
 def test_no_axis_is_much_worse_than_by_px4(errors: dict[str, dict[str, Rows]]) -> None:
-    """Of nine figures the yaw rate beside roll doublets is the hardest: sideslip by gravity.
+    """The hardest of nine figures is the yaw rate in roll doublets, because of the sideslip.
 
-    With a feedforward that did not know the bank it was 25 mrad/s, 1.2 times that of PX4's form.
+    With a feedforward that did not know the bank it was 25 mrad/s, 1.2 times the figure of PX4's
+    form.
     """
     law, px4 = errors["law"], errors["px4"]
     assert law["p"][2] < 0.5 * px4["p"][2]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights of the module's switch around a linear airplane: tests/px4/flight.c.
+"""Test flights of the module's switch with a linear airplane: tests/px4/flight.c.
 
 Setpoint, gyro, spare and parameters are as an autopilot and its user may give them. The samples
-come at 250 Hz where a flight names no rate. RISE-DI is enabled at 2.5 s of 10 s.
+come at 250 Hz unless a flight names a rate. RISE-DI is enabled at 2.5 s of 10 s.
 """
 
 import csv
@@ -45,7 +45,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def flown(program: Path, **words: float) -> dict[str, float]:
-    """The figures of a flight. A finding of a sanitizer ends it."""
+    """Return the figures of a flight. A finding of a sanitizer ends it."""
     command = [str(program), *(f"{name}={value}" for name, value in words.items())]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -56,7 +56,10 @@ def flown(program: Path, **words: float) -> dict[str, float]:
 
 @pytest.mark.parametrize("set_hz", [250.0, 50.0, 20.0, 10.0, 2.0])
 def test_slow_setpoint_is_held(program: Path, set_hz: float) -> None:
-    """PX4 asks 2 Hz in offboard: one take-over, and the error of a setpoint at the full rate."""
+    """PX4 asks for 2 Hz in offboard.
+
+    There is one take-over, and the error is as at the full rate.
+    """
     figures = flown(program, set_hz=set_hz)
     assert figures["takeovers"] == 1
     assert figures["fallbacks"] == 0
@@ -76,9 +79,9 @@ def test_setpoint_that_stops_is_held_as_long_as_the_autopilot_holds_it(program: 
 
 
 def test_law_keeps_its_period_under_any_faster_gyro(program: Path) -> None:
-    """250 ticks a second: the ratio of the rates need not be a whole number.
+    """There are 250 ticks per second, and the ratio of the rates need not be a whole number.
 
-    The error stays that of 250 Hz, where each sample is a tick.
+    The error stays as small as at 250 Hz, where each sample is a tick.
     """
     at_the_rate = flown(program)["rms"]
     for hz in (251.0, 300.0, 330.0, 400.0, 800.0, 1000.0, 2000.0):
@@ -100,7 +103,7 @@ def test_slower_gyro_is_refused_by_its_measured_rate(program: Path) -> None:
 
 
 def test_gyro_that_becomes_slower_in_flight_hands_over(program: Path) -> None:
-    """Within two windows of a second."""
+    """It hands over within two windows of a second."""
     figures = flown(program, hz_at=5.0, next_hz=200.0)
     assert figures["refusal"] == SLOW
     assert figures["fell"] < 7.0
@@ -117,7 +120,7 @@ def test_return_after_a_fault_waits_for_a_second(program: Path, name: str) -> No
 
 @pytest.mark.parametrize("at", [0.3, 2.4, 5.0])
 def test_torque_of_the_spare_with_nan_counts_as_none(program: Path, at: float) -> None:
-    """Before the take-over, and in flight: it takes over, and no NaN is sent."""
+    """A NaN before the take-over and in flight does not prevent it, and no NaN is sent."""
     for name in ("nan_spare_at", "nan_thrust_at"):
         figures = flown(program, **{name: at})
         assert figures["takeovers"] == 1
@@ -137,10 +140,11 @@ def test_spare_that_never_published_is_not_taken_over_from(program: Path) -> Non
 
 
 def test_spare_that_stops_in_flight_leaves_rise_di_alone(program: Path) -> None:
-    """It flies on, and returns at once after a NaN of the gyro.
+    """It flies on, and returns immediately after a NaN of the gyro.
 
-    So it does switched off, with a wrong parameter, and with a gyro that became slow. The thrust is
-    that of the setpoint, which the spare would hand on: it moves on, not frozen.
+    It also flies on when it is switched off, with a wrong parameter, and with a gyro that became
+    slow. The thrust is the one of the setpoint, which the spare would pass on. So it changes, and
+    is not frozen.
     """
     nothing_to_go_to = {"wrong_age_at": 6.0}, {"hz_at": 6.0, "next_hz": 200.0}
     for words in ({}, {"off_at": 6.0}, *nothing_to_go_to):
@@ -156,7 +160,7 @@ def test_spare_that_stops_in_flight_leaves_rise_di_alone(program: Path) -> None:
 
 
 def test_nothing_frozen_is_sent_where_neither_controls(program: Path) -> None:
-    """The spare and the setpoint stop: the torque fades to 0, the thrust is 0."""
+    """The spare and the setpoint stop. Then the torque fades to 0, and the thrust is 0."""
     figures = flown(program, stop_spare_at=5.0, stop_set_at=5.0)
     assert figures["refusal"] == STALE_SETPOINT
     assert figures["torque"] < 1e-3

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The proof of the source: Frama-C finds no alarm in an export, and finds one that is put in."""
+"""Test the proof of the source: Frama-C finds no alarm in an export, and finds one put in."""
 
 import shutil
 from pathlib import Path

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a recorder knows of a topic: lost messages, and silences while the other topics go on."""
+"""Test what a recorder knows about a topic: lost messages, and silences while others go on."""
 
 from collections.abc import Iterable
 from itertools import count
@@ -12,7 +12,7 @@ from flight_recorder.silences import Silences
 
 
 class Channel:
-    """A channel of a bag that counts its messages alone."""
+    """A channel of a bag that only counts its messages."""
 
     def __init__(self) -> None:
         self.messages = 0
@@ -24,7 +24,10 @@ def recorded(name: str = "/y", *, is_foreign: bool = False) -> RecordedTopic:
 
 
 def lost(topic: RecordedTopic, messages: Iterable[tuple[int, str]]) -> list[int]:
-    """How many messages were lost before each of these, which are sequences and publishers."""
+    """Return how many messages were lost before each of these.
+
+    A message is given by its sequence and its publisher.
+    """
     return [
         0 if topic.is_next(sequence) else topic.lost_before(sequence, publisher)
         for sequence, publisher in messages
@@ -42,7 +45,7 @@ def test_restarted_publisher_has_lost_nothing() -> None:
 
 
 def test_interleaved_sequences_of_one_name_are_no_loss() -> None:
-    """Two publishers have this name: the sequence goes back, and no gap counts from then on."""
+    """Two publishers have this name, so the sequence goes back, and no gap counts from then on."""
     messages = [(number, "/aircraft#0") for pair in zip(count(9), range(3)) for number in pair]
     assert lost(recorded(), messages[:2]) == [0, 0]
     assert lost(recorded(), messages) == [0] * len(messages)

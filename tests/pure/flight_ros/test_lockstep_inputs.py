@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""y and a second signal of a lockstep flight come together.
+"""Test that y and a second signal of a lockstep flight are complete together.
 
 The order in which they arrive does not matter.
 """
@@ -36,7 +36,7 @@ class Arriving:
         return taken
 
     def instants(self) -> list[Instant]:
-        """The instants that are complete now."""
+        """Return the instants that are complete now."""
         return list(self.inputs.complete())
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The profile of the middleware for several hosts, and the addresses that are refused."""
+"""Test the middleware's profile for several hosts, and which addresses are refused."""
 
 from xml.etree import ElementTree
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ticks: deadlines on the monotonic clock, overruns, the busy-wait before a deadline."""
+"""Test ticks: deadlines on the monotonic clock, overruns, and the busy-wait before a deadline."""
 
 import time
 
