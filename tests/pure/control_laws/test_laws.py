@@ -197,7 +197,7 @@ def test_another_law_or_observer_refused_in_flight() -> None:
     controller_of_pi = Controller(controller("pi"))
     for name in ("rise_di", "pid", "pi, observer"):
         expected = (
-            r"controller\.law: found \w+, expected the law and the observer that fly: "
+            r"controller\.law: found \w+, expected the law and the observer in use: "
             r"these change at a restart"
         )
         with refusing(expected):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Test that a flight that learned has the margins of each model that flew.
+"""Test that a flight that learned has the margins of each model that was used.
 
 The margins are around the file and around the true aircraft.
 """
@@ -113,7 +113,7 @@ def test_page_has_margins_and_curves_of_each_model(
         [RecordedFlight("learns", learns, flight, summary, controllers=controllers)],
     )
     page = (tmp_path / "page.html").read_text()
-    assert "by the parameters that flew" in page
+    assert "by the parameters in use" in page
     in_degrees = page.partition('data-angles="deg"')[2].partition('data-angles="rad"')[0]
     rows = [in_degrees.count(f'<th scope="row">{name}</th>') for name in ("start", "file")]
     assert rows == [3, 3]

@@ -505,7 +505,7 @@ def test_command_finds_one_bit_of_one_gain_in_scenario_of_log(tape: Tape, tmp_pa
     assert number is not None
     assert re.match(r"201 ticks, \d+ differ, the last at t = .* s; u_free in \d+, u in \d+", count)
     assert note.startswith(
-        "note: 201 ticks, from tick 1 at t = 0 s on, flew with other parameters than the log "
+        "note: 201 ticks, from tick 1 at t = 0 s on, had other parameters than the log "
         "holds: the controller got another file than the recorder (with its file: `rise-di replay "
         "RUN --scenario FILE`)"
     )

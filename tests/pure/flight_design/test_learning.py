@@ -438,7 +438,7 @@ def test_identification_is_due_where_last_proposal_does_not_fly(
     for k in range(1001, 1500):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     # other parameters fly: the proposal was refused, or the controller fell back
-    assert made.propose(0).sentence == "each part already flies the initial law"
+    assert made.propose(0).sentence == "each part already has the initial law"
     identified.assert_called_once()
 
 
@@ -583,9 +583,9 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     refused = made.propose(0)
     assert refused.controller is None
     assert str(refused.sentence).startswith(
-        "q and V: found no model with coupling, expected one, like the model that flies; p and r"
+        "q and V: found no model with coupling, expected one, like the model in use; p and r"
     )
-    # the search begins at the model that flies too
+    # the search begins at the model in use too
     assert [call.kwargs["flown"] for call in identified.call_args_list] == [None, made.model]
     made._planned.appendleft(0)
     # a model with coupling that predicts worse than the file by two deviations is forgotten
@@ -641,7 +641,7 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     none_left = without_models(start, fresh, ["p", "r"]).digest()
     sentences = [restarted.propose(none_left, NAMES).sentence for _ in range(2)]
     assert sentences == [
-        "no part is left to learn: each lacks an input or flies the initial law",
+        "no part is left to learn: each lacks an input or has the initial law",
         None,
     ]
 
@@ -749,7 +749,7 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
     )
     part = lateral()._replace(outputs=("q", "V"), entries=effects, has_gusts=True)
     assert str(part_checks.reason_against_effects(part, flown)).startswith(
-        "B[q, elevator]: found 70 % of that of the model that flies"
+        "B[q, elevator]: found 70 % of the effect in the model in use"
     )
     # a first model, one without gusts, and one that is within the deviation that is allowed
     assert part_checks.reason_against_effects(part, None) is None

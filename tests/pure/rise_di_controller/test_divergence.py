@@ -33,7 +33,7 @@ def test_divergence_is_three_times_the_error_before(
     assert divergence.diverging(state, least, np.array([True, True])).tolist() == [expected, False]
     assert not divergence.diverging(
         state, least, np.array([False, True])
-    ).any()  # q flies the initial law
+    ).any()  # the initial law controls q
 
 
 def test_running_mean_square_reaches_that_of_a_constant_error() -> None:

@@ -265,7 +265,7 @@ def test_second_and_late_proposals_are_refused() -> None:
     ] == [
         "one at a time",
         "",
-        "one that ends at least 1 s after that of the last proposal",
+        "one that ends at least 1 s after the window of the last proposal",
         "0 to 30 s",
         "0 to 30 s",
     ]

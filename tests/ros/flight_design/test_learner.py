@@ -96,7 +96,7 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     # the flight goes on beside the stopped learner: half a second
     command.wait_for_log(tmp_path / "runs", logged + 100_000)
     learning.kill()
-    command.wait_for("learner was killed by SIGKILL: the law flies on with the model that it has")
+    command.wait_for("learner was killed by SIGKILL: the law continues with the model that it has")
     said = command.output.count("no model: record")
     start(
         "flight_design.main", "--ros-args", "-p", f"scenario_file:={killed_scenario.path}"

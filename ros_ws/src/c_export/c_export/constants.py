@@ -213,7 +213,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
         least, largest = airspeed_range(law_params)
         reals |= {
             "speed": law_params.speed,
-            "airspeed": law_params.airspeed,
+            "airspeed": law_params.is_airspeed,
             "time": law_params.time,
         }
         reals |= {"V_least": least, "V_largest": largest}

@@ -386,7 +386,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
 
     Returns the sets, the recording, and the number of ticks whose u equals the u in the log. The
     sets are the parameters at the start of the flight, and the parameters after each change in
-    flight. Raises ParameterError if the changes in the log do not lead to the parameters that flew.
+    flight. Raises ParameterError if the changes in the log do not lead to the parameters that were
+    used.
     """
     sets = [exportable(recorded_parameters(run.scenario_file()))]
     changes = [*recorded_changes(run, sets[0])]

@@ -65,13 +65,13 @@ def campaign_law(
     engage: Callable[[Measurements, Any], Any],
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> ControlLaw:
-    """Return a control law that only campaigns fly, because no topic has its measurements.
+    """Return a control law that only campaigns use, because no topic has its measurements.
 
     The law cannot be retuned in flight.
     """
 
     def retune(state: Any, old: Any, new: Any) -> Any:
-        raise NotImplementedError("a law that only campaigns fly has no retuning")
+        raise NotImplementedError("a law that only campaigns use has no retuning")
 
     return ControlLaw(
         state=state, engage=engage, step=without_limits(limited), limited=limited, retune=retune

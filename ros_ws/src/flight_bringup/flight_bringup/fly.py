@@ -296,7 +296,7 @@ def _announce_learned(
     for instant, sentence in processes.monitor.learned():
         announce(f"t = {instant - start_time:.2f} s: {sentence}")
     if (outcome := processes.pop_end_of_learner()) is not None:
-        announce(f"{outcome.reason}: the law flies on with the model that it has")
+        announce(f"{outcome.reason}: the law continues with the model that it has")
 
 
 def _follow_lockstep(

@@ -89,8 +89,8 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     """Check that the bridge can send all that the controller may command.
 
     If the bridge could not, it would clip u, and the anti-windup of the law would not know of it.
-    The limits of the scenario are not narrowed, because the log must hold the parameters that flew.
-    A dry run sends nothing, so it passes the check. The check fails for a controller that holds u
+    The limits of the scenario are not narrowed, because the log must have the parameters in use. A
+    dry run sends nothing, so it passes the check. The check fails for a controller that holds u
     while it is inactive, because the bridge engages only if u is near trim. Raises ParameterError
     if the check fails.
     """

@@ -67,7 +67,7 @@ RERUN = 3  # number of worst aircraft of a case for which scenarios are written
 FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
 OF_LEARNER = {
     FIRST_MODEL: "first model (s)",
-    "models": "models that flew",
+    "models": "models used",
     "refused": "models refused",
 }
 
@@ -89,10 +89,9 @@ GUARANTEE_LEGEND = (
 
 
 LEARNER_LEGEND = (
-    "first model: when it flew; models refused: by the learner, which says why during the flight, "
-    "or by the controller; fallbacks:"
-    " to the initial law, in all outputs or in some. The margins above are those of the "
-    "initial law"
+    "first model: from when on it was used; models refused: by the learner, which says why during "
+    "the flight, or by the controller; fallbacks: to the initial law, in all outputs or in some. "
+    "The margins above belong to the initial law"
 )
 
 

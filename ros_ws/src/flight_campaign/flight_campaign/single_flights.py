@@ -42,8 +42,8 @@ CHUNK = 4
 class LearningOutcome(NamedTuple):
     """What became of the identifications in a flight."""
 
-    first_model: float  # s, instant from which the first learned model flew; NaN if no model flew
-    models: int  # number of proposals that flew, without the rough model
+    first_model: float  # s, instant from which the first learned model was used; NaN if none was
+    models: int  # number of proposals that were used, without the rough model
     # number of identifications that the learner refused, and of proposals that the controller
     # refused
     refused: int

@@ -383,7 +383,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
             )
     print_table(console, table)
     print_table(console, loop)
-    # If the model of a channel is not certain, the channel flies by its step response.
+    # If the model of a channel is not certain, its gains come from its step response.
     uncertain = [
         name
         for name, model in zip(response.outputs, models, strict=True)

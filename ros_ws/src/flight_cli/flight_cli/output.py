@@ -90,7 +90,7 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
 
 
 def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) -> None:
-    """Print the margins for each set of parameters that flew, if they changed in flight."""
+    """Print the margins for each set of parameters, if they changed in flight."""
     from flight_analysis.report import margin_figures  # noqa: PLC0415 - loads SciPy
 
     flown = flown_loops(flight.tape, scenario, flight.controllers, flight.later_aircraft)

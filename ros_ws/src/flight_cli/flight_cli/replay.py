@@ -128,7 +128,7 @@ class Shown(NamedTuple):
     differences: tuple[str, ...] = ()  # how the aircraft differs from what the controller knew
 
     def notes(self) -> list[str]:
-        """Return notes on the computation, and on ticks that flew with other parameters."""
+        """Return notes on the computation, and on ticks that had other parameters."""
         result = self.result
         notes = [*result.notes, *(() if self.guided is None else self.guided.notes)]
         rows = np.flatnonzero(result.other_parameters)
@@ -147,7 +147,7 @@ class Shown(NamedTuple):
                     "of the log)"
                 )
             notes.append(
-                f"{len(rows)} ticks, {begin}, flew with other parameters than the log holds: {why}"
+                f"{len(rows)} ticks, {begin}, had other parameters than the log holds: {why}"
             )
         return notes
 

@@ -52,7 +52,7 @@ from flight_design.identification.model_identification import (
     with_entries,
 )
 from flight_design.identification.model_quality import NoBetter
-from flight_design.identification.model_refusals import best_known, in_time
+from flight_design.identification.model_refusals import best_known, entries_without
 from flight_design.identification.own_loop import own_loop
 from flight_design.identification.rates_log import SPARSE, RatesLog, rates_of_log, scaled_torques
 from flight_design.identification.rates_model import banking, identify_rates
@@ -393,7 +393,7 @@ def _uncertainty(identification: Identification) -> float:
     relative = [
         effect.deviation * abs(effect.nominal / effect.value)
         for part in identification.parts
-        for effect in best_known(in_time(part.entries, part.by_timing), part.outputs)
+        for effect in best_known(entries_without(part.entries, part.by_timing), part.outputs)
     ]
     return float(np.clip(2.0 * max(relative), LEAST, MOST))
 

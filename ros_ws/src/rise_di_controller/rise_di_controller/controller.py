@@ -189,7 +189,7 @@ class Controller:
             new.names == self.names,
             "controller.law",
             new.parameters.law,
-            "the law and the observer that fly: these change at a restart",
+            "the law and the observer in use: these change at a restart",
         )
         before = self._parameters
         self._state = retuning.retune_state(

@@ -465,7 +465,11 @@ class RiseDiConfig(ControllerConfig):
         return TunedLaw(
             with_schedule(law.control_law),
             ScheduleParams(
-                law=law.params, speed=speed, airspeed=self._is_airspeed(), time=time, observer=over
+                law=law.params,
+                speed=speed,
+                is_airspeed=self._is_airspeed(),
+                time=time,
+                observer=over,
             ),
         )
 

@@ -40,7 +40,7 @@ NO_GUARANTEE = ModelGuarantee(0.0, "0")
 
 
 class LearnerResult(NamedTuple):
-    """Result of an identification in flight: parameters to fly, or why there are none."""
+    """Result of an identification in flight: new parameters, or why there are none."""
 
     controller: RiseDiConfig | None
     sentence: str | None  # None if no identification was due

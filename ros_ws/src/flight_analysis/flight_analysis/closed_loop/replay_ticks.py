@@ -43,9 +43,8 @@ class ParametersInForce:
     """The parameters of a recorded controller at a tick, and the changes that are still to come."""
 
     def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
-        self._changed: dict[
-            str, list[int]
-        ] = {}  # numbers of ticks, by the names of the changed values
+        # numbers of ticks, by the names of the changed values
+        self._changed: dict[str, list[int]] = {}
         self._first = parameters
         self._changes = list(changes)
         self.begin()

@@ -152,14 +152,14 @@ def _changed_card(flown: FlownLoops) -> Card:
 def _learned_card(flight: RecordedFlight) -> Card:
     """Return the card about the models, A and B, that were learned in flight.
 
-    The card says how many of these models flew, and how the error changed.
+    The card says how many of these models were used, and how the error changed.
     """
     spans = flight.summary["models"]
     learned = learned_spans(flight)
     if not learned:
         return Card(
             title="Learned models",
-            sentences=["No learned model flew: the initial law flew to the end."],
+            sentences=["No learned model was used: the initial law was in control to the end."],
         )
     changes = []
     for name, before in spans[0]["rms"].items():
@@ -168,12 +168,9 @@ def _learned_card(flight: RecordedFlight) -> Card:
             unit = flight.units[name]
             values = (format_value(before, unit.factor), format_value(after, unit.factor))
             changes.append(f"{name} {values[0]} to {values[1]} {unit.unit}")
-    sentences = [
-        (
-            f"{len(learned)} learned model{'s' if len(learned) > 1 else ''} flew, the first from "
-            f"t = {format_seconds(learned[0]['start'])} on."
-        )
-    ]
+    used = "models were" if len(learned) > 1 else "model was"
+    start = format_seconds(learned[0]["start"])
+    sentences = [f"{len(learned)} learned {used} used, the first from t = {start} on."]
     if changes:
         sentences.append(
             f"Rms error under the initial law, and under the last model: {', '.join(changes)}."

@@ -190,17 +190,20 @@ def _route_text(flight: RecordedFlight) -> str:
 
 
 def _models_text(flight: RecordedFlight) -> str:
-    """Say how many learned models flew. Returns "" for a flight that did not learn."""
+    """Say how many learned models were used. Returns "" for a flight that did not learn."""
     if not flight.summary["models"]:
         return ""
     count = len(learned_spans(flight))
     if not count:
-        return "No model of the aircraft that was learned in flight flew"
-    return f"{count} model{'' if count == 1 else 's'} of the aircraft, learned in flight, flew"
+        return "No model of the aircraft that was learned in flight was used"
+    used = "model of the aircraft, learned in flight, was used"
+    if count > 1:
+        used = "models of the aircraft, learned in flight, were used"
+    return f"{count} {used}"
 
 
 def learned_spans(flight: RecordedFlight) -> list[Mapping[str, Any]]:
-    """Return the spans of time in which the law flew with a model that was learned in flight.
+    """Return the spans of time in which the law used a model that was learned in flight.
 
     Spans before the first learned model are left out, and spans with the model of the airframe
     file.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find which parameters the controller had during a flight, and build the loops that flew.
+"""Find which parameters the controller had during a flight, and build their linear loops.
 
 Each linear loop is built around the aircraft of the airframe file, or around the true aircraft of a
 simulation.
@@ -44,7 +44,7 @@ TRUE = "true"
 
 
 class FlownController(NamedTuple):
-    """A set of parameters of the controller, and the spans of time in which it flew.
+    """A set of parameters of the controller, and the spans of time in which it was used.
 
     A span is the time, s, of the first and of the last tick with these parameters.
     """
@@ -61,10 +61,10 @@ class FlownController(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class FlownLoop:
-    """The linear loop of an aircraft with controller parameters that flew."""
+    """The linear loop of an aircraft with controller parameters that were used."""
 
-    name: str  # name of the parameters; empty if they flew the whole flight
-    times: str  # when the parameters flew, as text, s
+    name: str  # name of the parameters; empty if they were used for the whole flight
+    times: str  # when the parameters were used, as text, s
     aircraft: str  # FILE or TRUE
     loop: LinearLoop
 
@@ -77,10 +77,10 @@ class FlownLoop:
 def flown_controllers(
     tape: Tape, start: ControllerConfig, changes: Sequence[Change]
 ) -> tuple[FlownController, ...]:
-    """Return the controller's parameters that flew, in order, and when each of them flew.
+    """Return the controller's parameters that were used, in order, and when each was used.
 
     `start` has the parameters with which the flight started, and `changes` has the changes in
-    flight. The digest of the parameters in each tick shows when each set flew.
+    flight. The digest of the parameters in each tick shows when each set was used.
     """
     by_digest = {start.digest(): start}
     latest = start
@@ -100,7 +100,7 @@ def flown_controllers(
 class FlownLoops(NamedTuple):
     """The linear loops of a flight, and how its aircraft differs from the controller's data."""
 
-    loops: list[FlownLoop]  # empty without a linear model, or if it is unknown what flew
+    loops: list[FlownLoop]  # empty without a linear model, or if the parameters are unknown
     sentences: tuple[str, ...]  # how the aircraft differs from what the controller was told
 
 
@@ -116,7 +116,7 @@ def flown_loops(
     controllers: Sequence[FlownController],
     later: Sequence[AircraftConfig] = (),
 ) -> FlownLoops:
-    """Return the linear loops of a flight, one for each set of parameters that flew.
+    """Return the linear loops of a flight, one for each set of parameters that was used.
 
     The loops have the lags and the delay of the aircraft that flew. If the true aircraft of a
     simulation differs from its airframe file, each set has a second loop, around the true aircraft.

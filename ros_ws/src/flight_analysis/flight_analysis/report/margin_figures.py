@@ -174,7 +174,7 @@ def margin_table(
 def flown_margin_table(flown: FlownLoops) -> MetricTable:
     """Return the table of the least margins of a flight's loops, with a row for each loop."""
     columns = [
-        Column(group="flown", head="from to (s)"),
+        Column(group="used", head="from to (s)"),
         Column(group="", head="aircraft"),
         Column(group="phase", head="deg"),
         Column(group="gain", head="dB"),
@@ -192,9 +192,7 @@ def flown_margin_table(flown: FlownLoops) -> MetricTable:
         "once. The aircraft is that of the file, or the true one as simulated before a drift"
     )
     note = ". ".join([*flown.sentences, note])
-    return MetricTable(
-        "Margins of the linear loop, by the parameters that flew", columns, rows, note
-    )
+    return MetricTable("Margins of the linear loop, by the parameters in use", columns, rows, note)
 
 
 def margins_as_json(margins: LoopMargins) -> dict[str, Any]:

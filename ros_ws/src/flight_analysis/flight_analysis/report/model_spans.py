@@ -57,11 +57,11 @@ def guarantees(tape: Tape) -> dict[int, KeptGuarantee]:
 
 
 def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]:
-    """Name the sets of parameters that flew, given the times at which they first flew, s.
+    """Name the sets of parameters of a flight, given the times of their first use, s.
 
     The times in `first` ascend, and the first set is named "start". `proposals` has the times of a
-    learner's proposals, s. A set that first flew before all proposals is "file", "file 2" and so
-    on. The other sets are "model 1", "model 2" and so on.
+    learner's proposals, s. A set that was first used before all proposals is "file", "file 2" and
+    so on. The other sets are "model 1", "model 2" and so on.
     """
     names = ["start"]
     for time in first[1:]:

@@ -264,7 +264,7 @@ def _with_times_of_messages(recorded: RecordedRun) -> Tape:
 def _controllers(
     recorded: RecordedRun, tape: Tape, scenario: Scenario
 ) -> tuple[FlownController, ...]:
-    """Return the controller's parameters that flew, or () if they did not change in flight."""
+    """Return the controller's parameters that were used, or () if they did not change in flight."""
     if len({span.digest for span in parameter_spans(tape)}) < 2:
         return ()
     changes = recorded_changes(recorded, scenario.controller)

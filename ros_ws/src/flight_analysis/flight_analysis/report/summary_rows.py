@@ -166,8 +166,8 @@ def model_rows(
 ) -> tuple[list[str], list[list[str]]]:
     """Return the headings and rows of a table of "models", the entry of a summary.
 
-    A row has the name of a model, the times at which it flew, and the rms of the errors. If the log
-    has the guarantee of a learned model, a further column has the number of standard deviations
+    A row has the name of a model, the times at which it was used, and the rms of the errors. If the
+    log has the guarantee of a learned model, a further column has the number of standard deviations
     within which every aircraft is stable.
     """
     channels = list(models[0]["rms"]) if models else []

@@ -207,9 +207,9 @@ def _most(unit: str) -> float:
 def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> list[Excess]:
     """Return the worst parts of the flight for output i.
 
-    The result has up to two parts for each span in which the law flew, and two for the last END of
-    the flight. Spans shorter than END are left out if there is a longer one. `group` holds the
-    outputs of the same kind as output i. The kinds are the airspeed and the rates.
+    The result has up to two parts for each span in which the law was engaged, and two for the last
+    END of the flight. Spans shorter than END are left out if there is a longer one. `group` holds
+    the outputs of the same kind as output i. The kinds are the airspeed and the rates.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
     spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

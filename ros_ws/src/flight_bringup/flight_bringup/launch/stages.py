@@ -288,7 +288,7 @@ def fail_on_exit(
 def say_on_exit(event: ProcessExited, context: LaunchContext, flight: Flight) -> list[Action]:
     """Say that the learner has ended, if it ends before the flight does. The flight goes on."""
     sentence = (
-        f"{event.process_name} ended before the flight did: the law flies on with the model "
+        f"{event.process_name} ended before the flight did: the law continues with the model "
         "that it has"
     )
     return [] if flight.is_over else [LogInfo(msg=sentence)]

@@ -18,8 +18,8 @@ from flight_design.identification.model_identification import Part
 from flight_design.identification.model_refusals import (
     MAX_DEVIATION,
     best_known,
+    entries_without,
     excitation_factor,
-    in_time,
 )
 from flight_design.identification.rates_model import without_trim
 
@@ -188,9 +188,9 @@ def factors_of(parts: Iterable[Part]) -> dict[str, float]:
     """
     factors = {}
     for part in parts:
-        entries = in_time(part.entries, part.by_timing)
+        entries = entries_without(part.entries, part.by_timing)
         if part.by_motion:
-            entries = in_time(entries, part.by_motion)
+            entries = entries_without(entries, part.by_motion)
         for effect in best_known(entries, part.outputs):
             if effect.deviation > MAX_DEVIATION:
                 factors[effect.row] = excitation_factor(effect)

@@ -405,7 +405,7 @@ class Search(Likelihood):
         return np.asarray(slopes.J @ slopes.e.ravel() + by_prior + slopes.half_log_det)
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
-        """Return the innovations of the model that flies, whose theta is `flown`, (p,).
+        """Return the innovations of the model in use, whose theta is `flown`, (p,).
 
         Winds, angles and delays come from the fits of the `parts` (groups of states that do not
         couple).

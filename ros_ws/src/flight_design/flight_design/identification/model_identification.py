@@ -66,7 +66,7 @@ from flight_design.identification.model_quality import (
 from flight_design.identification.model_refusals import (
     Coupling,
     at_bound,
-    in_time,
+    entries_without,
     reason_against_airframe,
     reason_against_excitation,
     reason_against_signs,
@@ -204,7 +204,7 @@ class _Study(NamedTuple):
             self.reason_against_airframe(search.about_centre(entries)),
             search.reason_against_air(fit),
             reason_against_timing(entries, by_timing.tolist(), outputs),
-            reason_against_excitation(in_time(entries, in_phase), outputs),
+            reason_against_excitation(entries_without(entries, in_phase), outputs),
             reason_against_signs(self.airframe, identified, self.channels),
             reason_against_prediction(before, after, outputs),
         )

@@ -121,15 +121,15 @@ def reason_against_signs(
     )
 
 
-def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
-    """Return entries with the standard deviations that they would have without one cause of error.
+def entries_without(entries: Iterable[Entry], by_cause: Iterable[float]) -> list[Entry]:
+    """Return entries with the standard deviations that they would have without a cause of error.
 
-    The cause is, for example, an uncertain delay of u. The result then has the standard deviations
-    for a known delay. `by_timing` has the part of each standard deviation that the cause makes.
+    `by_cause` has the part of each standard deviation that the cause makes. If the cause is, for
+    example, an uncertain delay of u, the result has the standard deviations for a known delay.
     """
     return [
-        entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - late**2, 0.0))))
-        for entry, late in zip(entries, by_timing, strict=True)
+        entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - part**2, 0.0))))
+        for entry, part in zip(entries, by_cause, strict=True)
     ]
 
 

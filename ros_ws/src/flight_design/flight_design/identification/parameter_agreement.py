@@ -111,7 +111,7 @@ def stick_of(channel_map: ChannelMap, name: str) -> Stick:
     if match is None:
         expected = "a field such as channels[1]"
         raise ParameterError(
-            f"trims.{name}: found none with a channel of the transmitter, expected {expected}"
+            f"trims.{name}: found no channel of the transmitter, expected {expected}"
         )
     responds, raw_sign = MOTIONS[row.positive]
     motions = "a motion of roll, pitch, yaw or thrust: the log is of a plane"

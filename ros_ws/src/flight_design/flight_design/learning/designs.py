@@ -164,7 +164,7 @@ def goal(
       has around the learned model, but at most the margin at the start of the flight. A learned
       part needs at least DEFAULT_MARGIN, or the margin at the start if this is smaller.
 
-    A `dead` output flies without this design, so it needs no margin. In any case an input must
+    A `dead` output does not use this design, so it needs no margin. In any case an input must
     tolerate DELAY_LEFT, s, beyond its `latest` delay, s. With a design for the file, the
     sensitivity must be at most 2, or the sensitivity of the loop with this design if it is larger.
     This bounds the phase and gain margins (Astrom, Murray, "Feedback Systems", 10.5).
@@ -211,17 +211,17 @@ def goal(
 def by_law_of_start(
     start: RiseDiConfig, left: Mapping[tuple[str, ...], str | None], *, has_file: bool
 ) -> set[str]:
-    """Return the outputs that fly by the law with which the flight started.
+    """Return the outputs that are controlled by the law with which the flight started.
 
     `left` has the parts of the aircraft that are left to this law, each with its dead input. A part
     is a group of states and inputs that does not couple with the rest.
 
-    - If the dead input is None, the controller no longer uses a model of the part. All outputs of
-      the part then fly by the law.
-    - If a part has a dead input and no design for the airframe file flies, all outputs of the part
-      fly by the law.
-    - If a part has a dead input and the design for the file flies (`has_file`), only the output of
-      the dead input flies by the law, and V if it is in the part.
+    - If the dead input is None, the controller no longer uses a model of the part. The law then
+      controls all outputs of the part.
+    - If a part has a dead input and no design for the airframe file is in use, the law controls all
+      outputs of the part.
+    - If a part has a dead input and the design for the file is in use (`has_file`), the law only
+      controls the output of the dead input, and V if it is in the part.
 
     In flights without an elevator, the observer of V erred four times as much as the law. The other
     outputs keep the design, because their inputs work. In flights without a rudder, the error of p

@@ -22,7 +22,7 @@ from flight_design.identification.model_refusals import (
     Coupling,
     at_bound,
     best_known,
-    in_time,
+    entries_without,
     reason_against_airframe,
 )
 from flight_design.learning.change_test import ANGLE
@@ -108,4 +108,4 @@ def _is_counted(part: Part, factor: float) -> bool:
 
 def _if_right(part: Part) -> list[Entry]:
     """Return the entries of a part with the deviations that they have if the model is exact."""
-    return in_time(part.entries, part.by_model or [0.0] * len(part.entries))
+    return entries_without(part.entries, part.by_model or [0.0] * len(part.entries))

@@ -29,7 +29,7 @@ class Sample(NamedTuple):
     stamp_ns: int
     y: FloatArray  # (m,)
     u: FloatArray  # (m,) inputs after their limits
-    flown: int  # digest of the parameters that flew in this tick
+    flown: int  # digest of the parameters in use in this tick
 
 
 class FlightRecord:
@@ -54,7 +54,7 @@ class FlightRecord:
 
     @property
     def flown(self) -> int | None:
-        """Digest of the parameters that flew in the last sample, or None if there is no sample."""
+        """Digest of the parameters in use in the last sample, or None if there is no sample."""
         return self._samples[-1].flown if self._samples else None
 
     @property

@@ -79,8 +79,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # s, shortest record: it has two held-out seconds, and `identify log` requires six
 SHORTEST = 20.0 * TRANSIENT
-# s from a fallback to the next identification, whose record then shows the parameters that fly
-# after the fallback
+# s from a fallback to the next identification, whose record shows the parameters used after it
 AFTER_FALLBACK = 4.0
 # s, from one identification to an unplanned one; also the length of a record tested for oscillation
 RETRY = 10.0
@@ -92,7 +91,7 @@ PartName = tuple[str, ...]
 
 
 class Verdict(NamedTuple):
-    """The model that flies after an identification, and sentences about the parts of this model."""
+    """The model in use after an identification, and sentences about the parts of this model."""
 
     model: Airframe  # the model in flight if no part has a new model
     known: dict[PartName, Known]
@@ -105,8 +104,8 @@ class Learner:
     """The record of y and u over a window, and the designs that are proposed from it.
 
     The parts of the aircraft (outputs that couple with no other part) are learned one by one. A
-    part without a learned model flies the design for the airframe file, which allows for errors, or
-    the initial law of the flight.
+    part without a learned model is controlled by the design for the airframe file, which allows for
+    errors, or by the initial law of the flight.
     """
 
     def __init__(
@@ -124,8 +123,8 @@ class Learner:
 
         `airframe` is the rough model, the prior. The delay in `actuation` is the delay of the loop
         beyond sampling and lags. `design_of_rough` makes a design for the rough model that allows
-        for its errors. This design flies from the start, and later in the parts without a learned
-        model. If `design_of_rough` is None, these parts fly by the initial law of the flight.
+        for its errors. It is in use from the start, and later in the parts without a learned model.
+        If `design_of_rough` is None, the initial law of the flight controls these parts.
 
         `rough` has the standard deviations of A and B in the rough model. It also has the noise of
         the disturbances, which a test for a change uses as well. With `quick`, an identification
@@ -136,7 +135,7 @@ class Learner:
         self._controller = controller
         self._rough = airframe
         self._design = design
-        # None if the rough model does not fly, or after the law fell back from it.
+        # None if the rough model is not used, or after the law fell back from it.
         self._design_of_rough = design_of_rough
         self._has_proposed_rough = False
         self._believed = rough
@@ -153,11 +152,11 @@ class Learner:
         self._tolerance_ns = nanoseconds(settings.check / 2.0)
         self._first_ns: int | None = None
         self._prior = airframe  # prior of the next identification
-        self._model = airframe  # the model that flies
+        self._model = airframe  # the model in use
         self._tried = airframe  # the model that the next identification tests
         self._tried_ns = -nanoseconds(RETRY)  # end of the record of the last identification
         self._known: dict[PartName, Known] = {}
-        # Parts that fly the initial law for good, each with its dead input, or with None if
+        # Parts that the initial law controls for good, each with its dead input, or with None if
         # the outputs are in `learn.without`, which the controller has given up.
         self._dead: dict[PartName, str | None] = {}
         self._start = controller  # with the `learn.without` of the parameters in flight
@@ -181,7 +180,7 @@ class Learner:
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Record a tick: y, and u after its limits, (m,), in the law's order.
 
-        `flown` is the digest of the parameters that flew in this tick.
+        `flown` is the digest of the parameters in use in this tick.
         """
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         self._record.take(Sample(stamp_ns, y, u, flown))
@@ -190,19 +189,20 @@ class Learner:
         """Propose parameters for the identified model, or return a sentence that says why not.
 
         The first proposal needs no record. It is a design for the rough airframe that allows for
-        errors. Parts whose models are refused later also fly by this design. If this proposal does
-        not fly, or if the law falls back, those parts fly by the initial law of the flight.
+        errors. Parts whose models are refused later also use this design. If the controller does
+        not take this proposal, or if the law falls back, the initial law of the flight controls
+        those parts.
 
         The last RECORD seconds are tested for a loss of effect. If an input has no effect any more,
-        its part flies by the initial law without this input. After a loss of effect, older samples
+        the initial law controls its part without this input. After a loss of effect, older samples
         are left out, and the flown model becomes the prior. If nothing is due, nothing is proposed.
         The result then has a sentence only if a single test has found that an input may have no
         effect.
 
-        While the rough model flies, the first model of a part is only on trial. The next
+        While the rough model is in use, the first model of a part is only on trial. The next
         identification proposes it if the samples since then show its advantage over the rough one.
 
-        `flown` is the digest of the parameters that fly. If it still differs from the digest of the
+        `flown` is the digest of the parameters in use. If it still differs from the digest of the
         last proposal after the latency, the controller refused the proposal or fell back. Then an
         identification is due. `given_up` has the outputs whose models the controller stopped using.
         They are not proposed again. If no part is left to learn, a sentence says so once.
@@ -228,7 +228,7 @@ class Learner:
         self._distrust(lost=lost)
         if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
             ended, self._has_ended = self._has_ended, True
-            none_left = "no part is left to learn: each lacks an input or flies the initial law"
+            none_left = "no part is left to learn: each lacks an input or has the initial law"
             return LearnerResult(None, None if ended else none_left)
         if changes := self._changes(end_ns):
             return self._damaged(changes, end_ns)
@@ -252,7 +252,7 @@ class Learner:
         # after a lost proposal, the next proposal has to leave out the dead inputs again
         leaves_out_again = lost and any(self._dead.values())
         if verdict.model is self._model and not leaves_out_again:
-            nothing = Refusal("each part already flies the initial law")
+            nothing = Refusal("each part already has the initial law")
             return LearnerResult(None, str(joined(verdict.refusals) or nothing))
         left_out = without_effect(self._dead, self._by_law(self._dead)) if lost else []
         price_text = self._adopt(verdict.model, verdict.known, self._dead)
@@ -267,7 +267,7 @@ class Learner:
         return LearnerResult(self._last, told, guarantee)
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
-        """Decide on parts that have changed; a part with a dead input flies without it at once.
+        """Decide on parts that have changed. A part stops using a dead input immediately.
 
         A changed part without a dead input is identified again, from the record since the change
         and around the flown model.
@@ -292,7 +292,7 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
-        """Decide which parts fly new models. `lost` says that the last proposal does not fly."""
+        """Decide which parts use new models. `lost` says that the last proposal is not in use."""
         known = dict(self._known)
         model = self._model
         told = list[str]()
@@ -532,7 +532,7 @@ class Learner:
         return found
 
     def _by_law(self, dead: Mapping[PartName, str | None]) -> set[str]:
-        """Return the outputs that fly by the flight's initial law, given the dead inputs."""
+        """Return the outputs that the flight's initial law controls, given the dead inputs."""
         return by_law_of_start(self._controller, dead, has_file=self._design_of_rough is not None)
 
     def _designed(
@@ -540,8 +540,8 @@ class Learner:
     ) -> tuple[RiseDiConfig, str | None]:
         """Design the controller for a model, and say what `learn.margin` costs in error.
 
-        Parts without a learned model fly by the initial law of the flight, or by the rough model as
-        long as it is in use. Raises ParameterError.
+        Parts without a learned model are controlled by the initial law of the flight, or by the
+        rough model's design as long as it is in use. Raises ParameterError.
         """
         start = self._controller
         without_learning = start.model_copy(update={"learn": None})

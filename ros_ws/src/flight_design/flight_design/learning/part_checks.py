@@ -95,13 +95,13 @@ def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal
 
 
 def return_to_file(part: Part, name: str | None) -> str:
-    """Say by which model or law a part flies now, because the model in flight predicted worse.
+    """Say which model or law a part uses now, because the model in flight predicted worse.
 
-    The model of the airframe file has predicted better. The part flies by the airframe `name`. If
-    `name` is None, it flies by the law with which the flight started.
+    The model of the airframe file has predicted better. The part uses the airframe `name`. If
+    `name` is None, it uses the law with which the flight started.
     """
-    flies = "the initial law" if name is None else f"the airframe {name} as it is"
-    return f"{' and '.join(part.outputs)} by {flies}: {_file_advantage(part)}"
+    used = "the initial law" if name is None else f"the airframe {name} as it is"
+    return f"{' and '.join(part.outputs)} by {used}: {_file_advantage(part)}"
 
 
 def _file_advantage(part: Part) -> str:
@@ -122,7 +122,7 @@ def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> R
         return None
     return Refusal(
         f"{' and '.join(part.outputs)}: found no model with coupling, expected one, like the model "
-        "that flies"
+        "in use"
     )
 
 
@@ -147,8 +147,9 @@ def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None
         )
         if share < 1.0 - MAX_DEVIATION:
             return Refusal(
-                f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, expected"
-                f" {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which hide effects"
+                f"{entry.name}: found {100 * share:.0f} % of the effect in the model in use, "
+                f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which hide "
+                "effects"
             )
     return None
 
@@ -170,9 +171,9 @@ def effect_sentence(part: Part) -> str:
 def without_effect(
     left: Mapping[tuple[str, ...], str | None], by_law: Collection[str]
 ) -> list[str]:
-    """Say which parts fly without an input, and which outputs fly by the flight's initial law.
+    """Say which parts do without an input, and which outputs the initial law controls.
 
-    `left` is as in `designs.by_law_of_start`, and `by_law` has the outputs that fly by this law.
+    `left` is as in `designs.by_law_of_start`, and `by_law` has the outputs that this law controls.
     """
     told = []
     for part, dead in left.items():

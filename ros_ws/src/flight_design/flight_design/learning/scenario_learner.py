@@ -224,7 +224,7 @@ class LearnResult(NamedTuple):
 
 
 class _Ticks(NamedTuple):
-    """The ticks of a log, and the parameters that flew at each tick."""
+    """The ticks of a log, and the parameters in use at each tick."""
 
     stamp_ns: NDArray[np.int64]
     instant_ns: NDArray[np.int64]
@@ -319,7 +319,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
 
 
 def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
-    """Return a scenario with the parameters that flew last in one of its runs, and without `learn`.
+    """Return a scenario with the parameters that one of its runs used last, and without `learn`.
 
     Raises ParameterError if the run had another controller.
     """

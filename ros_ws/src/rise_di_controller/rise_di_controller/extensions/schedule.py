@@ -41,19 +41,19 @@ class OverSpeed(NamedTuple):
     model: Callable[[float], Any]  # the model at d, a multiple of 1 / STEPS
     least: float
     most: float
-    airspeed: FloatArray  # 1 for the output V, else 0, (m,)
+    is_airspeed: FloatArray  # 1 for the output V, else 0, (m,)
 
     def at_scale(self, scale: FloatArray) -> Any:
         """Return the model at the airspeed that belongs to given factors of input_scale, (m,).
 
         The factors `scale` are (V0 / V)^2 in every channel except V.
         """
-        d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
+        d = 1.0 / math.sqrt(((1.0 - self.is_airspeed) * scale).max()) - 1.0
         return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
 
     def at_scales(self, scales: FloatArray) -> list[Any]:
         """Return the models of T ticks, given the factors of input_scale at each tick, (T, m)."""
-        d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
+        d = 1.0 / np.sqrt(((1.0 - self.is_airspeed) * scales).max(axis=1)) - 1.0
         return [
             self.model(place)
             for place in (np.round(np.clip(d, self.least, self.most) * STEPS) / STEPS).tolist()
@@ -63,7 +63,7 @@ class OverSpeed(NamedTuple):
 def over_speed(
     ratios: tuple[float, float],
     values: tuple[FloatArray, FloatArray, FloatArray],
-    airspeed: FloatArray,
+    is_airspeed: FloatArray,
     model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
     """Interpolate a model over the airspeed, as trim + d (slope + d curvature), d = V / V0 - 1.
@@ -82,10 +82,10 @@ def over_speed(
     @lru_cache(maxsize=512)
     def model_at(d: float) -> Any:
         return model(
-            trim + d * (slope + d * curvature), airspeed + (1.0 - airspeed) / (1.0 + d) ** 2
+            trim + d * (slope + d * curvature), is_airspeed + (1.0 - is_airspeed) / (1.0 + d) ** 2
         )
 
-    return OverSpeed(model_at, least, most, airspeed)
+    return OverSpeed(model_at, least, most, is_airspeed)
 
 
 class ScheduleParams(NamedTuple):
@@ -93,7 +93,7 @@ class ScheduleParams(NamedTuple):
 
     law: Any  # parameters of the extended law
     speed: Array  # trim speed V0, m/s, ()
-    airspeed: Array  # 1 for the output V, else 0, (m,)
+    is_airspeed: Array  # 1 for the output V, else 0, (m,)
     time: Array  # time constant with which the factor follows the airspeed, s, ()
     # ObserverParams as a function of the airspeed; None without an observer
     observer: OverSpeed | None = None
@@ -126,9 +126,9 @@ def target_scale(y: Array, params: ScheduleParams) -> Array:
     """
     xp = array_namespace(y)
     least, largest = airspeed_range(params)
-    V = params.speed + (params.airspeed * y).sum(axis=0)
+    V = params.speed + (params.is_airspeed * y).sum(axis=0)
     ratio = params.speed / xp.minimum(xp.maximum(V, least + 0.0 * V), largest + 0.0 * V)
-    return params.airspeed + (1.0 - params.airspeed) * (ratio * ratio)
+    return params.is_airspeed + (1.0 - params.is_airspeed) * (ratio * ratio)
 
 
 def side_by_side(params: ObserverParams, scale: FloatArray) -> FloatArray:

@@ -57,7 +57,7 @@ class GuardParams(NamedTuple):
     limits: Limits
     samples: SampleLimits  # bounds of the samples of y and y_m
     nominal: Nominal | None = None  # None without a feedforward
-    # number of ticks over which a new observer runs before it flies; if 0, it starts from the
+    # number of ticks on which a new observer is run before it is used; if 0, it starts from the
     # present error
     history: int = 0
     allocation: Allocation | None = None  # None if the inputs of the law are the effectors

@@ -22,11 +22,9 @@ double eigenvalue 1, which rounding splits by the root of the rounding error, 1e
 
 ROOT = np.sqrt(3.0)  # factor of the normalised second Legendre polynomial, ROOT (2 s - 1)
 
-SMALL = (
-    2.0**-40
-    # Step with which `linear_law` differentiates. It is below every limit and every width of a soft
-    # sign. A division by it loses no digit, because it is a power of two.
-)
+SMALL = 2.0**-40
+"""Step with which `linear_law` differentiates. It is below every limit and every width of a soft
+sign. A division by it loses no digit, because it is a power of two."""
 
 
 class LinearPlant(NamedTuple):

@@ -58,7 +58,7 @@ def least(outputs: tuple[str, ...]) -> FloatArray:
 def step(errors: Errors, e: FloatArray, dt: float, *, has_learned_model: bool) -> Errors:
     """Update the mean squares by a tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now).
 
-    `largest` changes only while no learned model flies.
+    `largest` changes only while no learned model is in use.
     """
     now = errors.now - np.expm1(-dt / MEMORY) * (e**2 - errors.now)
     return Errors(now, errors.largest if has_learned_model else np.maximum(errors.largest, now))
@@ -70,8 +70,8 @@ def diverging(
     """Return which outputs, (m,), diverge under a learned model.
 
     An output diverges if its rms error is above FACTOR times the largest rms error that it had
-    without a learned model, and above `least`. Outputs that still fly without a learned model are
-    left out. `is_learned` (m,) is False for them.
+    without a learned model, and above `least`. Outputs that have no learned model yet are left out.
+    `is_learned` (m,) is False for them.
     """
     return is_learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
 

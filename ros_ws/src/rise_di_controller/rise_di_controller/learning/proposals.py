@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decide in the controller what becomes of models that are learned in flight.
 
-This module decides when identifications begin, which proposed models fly, and when to fall back to
-the initial law. It has no side effects, so the node and the loop in one process both use it.
+This module decides when identifications begin, which proposed models are used, and when to fall
+back to the initial law. It has no side effects, so both the node and the in-process loop use it.
 """
 
 from collections import Counter, deque
@@ -66,7 +66,7 @@ class Proposal(NamedTuple):
 
     stamp_ns: int  # the end of the window, which is the instant of its last tick
     start: int  # digest of the parameters at the start of the flight, which the learner has
-    flown: int  # digest of the parameters that flew at the end of the window
+    flown: int  # digest of the parameters in use at the end of the window
     # all parameters of DESIGNED by dotted name, None for one that is removed; empty if no model is
     # proposed
     change: Mapping[str, Any]
@@ -87,7 +87,7 @@ class Event(NamedTuple):
 
 
 UNVERIFIED = "until a model is learned"
-"""End of the sentence of a proposal that flies the rough model before there is any record."""
+"""End of the sentence of a proposal to use the rough model before there is any record."""
 
 FALLBACKS = 2
 """Number of fallbacks in an engagement after which a part of the model gets no further models. By
@@ -274,7 +274,7 @@ class Learning:
     ) -> RiseDiConfig:
         """Fall back in the outputs that oscillate, and in outputs that the model couples with them.
 
-        All of these outputs fly the initial law until the engagement ends.
+        The initial law controls all of these outputs until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -297,7 +297,7 @@ class Learning:
     def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Forget all proposals and fallbacks.
 
-        Returns the initial parameters if a model flew, else None.
+        Returns the initial parameters if a model was in use, else None.
         """
         self._updates = Updates(self._settings)
         self._certificate = None
