@@ -218,7 +218,7 @@ def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
         "roll right",
         "nose left",
     ]
-    assert "without those of alpha_dot" in note
+    assert "without the ones by alpha_dot" in note
 
 
 def supra(axes: float) -> str:

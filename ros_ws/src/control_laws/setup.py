@@ -8,7 +8,7 @@ setup(
     name="control_laws",
     version=ElementTree.parse("package.xml").findtext("version"),
     description="Control laws other than RISE-DI, each a module of equations; the controller "
-    "flies those of y alone.",
+    "flies the laws that need only y.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["control_laws"],

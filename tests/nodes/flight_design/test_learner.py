@@ -81,7 +81,7 @@ def test_controller_refuses_a_lie_and_a_hasty_proposal_and_flies_a_certified_mod
     lie = proposer.answer(lambda: proposer.propose(change={"observer.F": flipped}))
     assert "spectral radius" in lie.sentence
     assert lie.values == {"event": "refused"}
-    assert "after that of the last proposal" in proposer.answer(proposer.propose).sentence
+    assert "after the window of the last proposal" in proposer.answer(proposer.propose).sentence
     flight.run(2.5)  # half of the least spacing
     flies = proposer.answer(proposer.propose)
     assert flies.sentence == "flies model"

@@ -386,8 +386,8 @@ def test_step_that_fails_leaves_the_last_u_m_and_the_node_goes_on(
     assert messages[3] != last
     assert len(messages) > 70  # of 75: none is left out
     lines = [line for line in flight.node.log.lines if "a step of guidance failed" in line]
-    goes_on = "a step of guidance failed, the last u_m goes on"
-    assert lines == [f"[WARNING] {goes_on}: IndexError index 7 is out of bounds"]
+    repeated = "a step of guidance failed, the last u_m is repeated"
+    assert lines == [f"[WARNING] {repeated}: IndexError index 7 is out of bounds"]
     assert diagnostics(flight.world, "/guidance")[1]["failed steps"] == "3"
     assert flight.last("failed") == 3.0
 

@@ -123,7 +123,7 @@ def test_step_that_fails_leaves_the_last_y_m_and_the_node_goes_on(
         world.run(1.1, lambda: world.send("/u_m", command(0.3), "/guidance#1"))
         assert world.last("/y_m")["p"] > before[-1].channels["p"]
         lines = [line for line in node.log.lines if "a step of the reference model failed" in line]
-        goes_on = "a step of the reference model failed, the last y_m goes on"
-        assert lines == [f"[ERROR] {goes_on}: ArithmeticError a value that is not finite"]
+        repeated = "a step of the reference model failed, the last y_m is repeated"
+        assert lines == [f"[ERROR] {repeated}: ArithmeticError a value that is not finite"]
         _, figures = diagnostics(world, "/reference_model")
         assert int(figures["failed steps"]) >= 45

@@ -467,7 +467,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
     (
         ("inputs", "elevator", "field"),
         "axes[0]",
-        r"map test\.inputs\.aileron\.field: found axes\[0\], that of elevator",
+        r"map test\.inputs\.aileron\.field: found axes\[0\], the field of elevator",
     ),
     (("inputs", "elevator", "lower"), 0.1, r"map test\.inputs\.elevator\.lower: found 0\.1"),
     (

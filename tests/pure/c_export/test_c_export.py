@@ -459,7 +459,8 @@ def test_command_proves_with_a_recorded_run(
     assert status.value.exit_code == 0
     # the ticks of the log
     assert "51 of 51 ticks have the u of the log to the bit" in capsys.readouterr().out
-    with refusing("run: found a flight with other parameters, expected those of osprey_servo"):
+    expected = "expected the parameters of osprey_servo"
+    with refusing(f"run: found a flight with other parameters, {expected}"):
         export("osprey_servo", tmp_path / "c", run=run, compiler=["gcc"])
 
 

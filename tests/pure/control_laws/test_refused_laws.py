@@ -101,7 +101,7 @@ def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_parameter_of_another_law_is_refused() -> None:
     pi = sections()["pi"]
     refused(
-        "controller.beta: found a parameter of rise_di, expected those of pi: K, Lambda",
+        "controller.beta: found a parameter of rise_di, expected keys of the law pi: K, Lambda",
         pi | {"beta": [1.0] * 4},
     )
     refused("controller.K: unknown key", sections()["rise_di"] | {"K": [1.0] * 4})
@@ -147,7 +147,7 @@ def test_an_invalid_observer_is_refused() -> None:
         return values | {"observer": observer | changes}
 
     refused(
-        "controller.observer: found no feedforward beside it, expected that section too",
+        "controller.observer: found no feedforward beside it, expected the section feedforward",
         values | {"feedforward": None},
     )
     refused(

@@ -95,7 +95,7 @@ def test_fault_of_the_reference_model_is_told(fault: Callable[[FloatArray], Floa
     y_m = replace(tape["y_m"], values=fault(tape["y_m"].values.copy()))
     (told,) = reference_shortfalls(with_y_m(tape, y_m), servo())
     assert told.aim is Aim.REFERENCE
-    assert told.sentence.startswith("y_m is not that of the scenario: ")
+    assert told.sentence.startswith("y_m differs from the scenario's: ")
 
 
 def with_y_m(tape: Tape, y_m: Signal) -> Tape:

@@ -139,7 +139,7 @@ def test_simulated_time_of_any_node_is_that_of_the_flight(
         ("a: {ros__parameters: {}, b: {}}", r"a: found no parameters under ros__parameters"),
         (
             "/uav1/controller: {ros__parameters: {}}\n/uav2/controller: {ros__parameters: {}}",
-            r"controller: found sections in /uav1 and in /uav2, expected those of one namespace",
+            r"controller: found sections in /uav1 and in /uav2, expected sections in one namespace",
         ),
     ],
 )

@@ -92,7 +92,7 @@ def test_lags_and_delay_that_were_not_told_are_those_of_the_margins() -> None:
     for name in ("elevator", "aileron", "rudder"):
         assert (
             f"aircraft.actuators.lag: the aircraft has 0.1 s in {name}, controller.lag 0.02 s; "
-            "margins and guarantee are those of the aircraft"
+            "margins and guarantee apply to the aircraft"
         ) in found
     assert any(
         text.startswith(
@@ -271,7 +271,7 @@ def test_an_aircraft_beyond_the_box_is_named_with_its_deviation() -> None:
     ("facts", "expected"),
     [
         (FlightFacts(tick=0.02), "ticks every 20 ms in the log, controller.rate: every 10 ms"),
-        (FlightFacts(has_parameters=False), "those that flew are not those of the file"),
+        (FlightFacts(has_parameters=False), "the flight had other ones than the file"),
         (FlightFacts(age=0.05), "age of u: 0.05 s in the log, controller.delay 0.003 s"),
         (
             FlightFacts(is_simulated=False, y_period=0.04),
@@ -344,5 +344,5 @@ def test_parameters_that_are_not_those_of_the_file_have_no_loop() -> None:
     other = SERVO.vary(controller={"beta": [2.0, 2.0, 1.0, 1.0]})
     flown = flown_loops(simulate(other), SERVO, ())
     assert not flown.loops
-    assert "those that flew are not those of the file" in flown.sentences[0]
+    assert "the flight had other ones than the file" in flown.sentences[0]
     assert not math.isnan(scenario_loop(other, other.controller).loop.delay)

@@ -159,7 +159,7 @@ def test_tuned_gains_written_to_new_folder_or_refused_in_sentence(tmp_path: Path
     result = TuningResult(gains={"K": [1.0]}, cost=2.0, seed=1, costs=[2.0, 3.0], evaluations=100)
     tuned_gains.save(path, {"pi": {"gust": result}}, ["gust"], "a command")
     assert tuned_gains.load(path) == {"pi": {"gust": result}}
-    with refusing(r"cannot be written \(.*\), expected a file of tuned gains that can$"):
+    with refusing(r"cannot be written \(.*\), expected a writable file of tuned gains$"):
         tuned_gains.save(path / "gains.yaml", {"pi": {"gust": result}}, ["gust"], "a command")
 
 
@@ -222,7 +222,7 @@ def test_the_command_writes_what_it_shows(
     assert result.exit_code == 0, result.output
     results = json.loads(path.read_text())
     assert results["wind"] == "published"
-    assert "effect of wind on x_dot that of the airframe" in result.stdout
+    assert "effect of wind on x_dot from the airframe file" in result.stdout
     assert [row["law"] for row in results["laws"]] == ["rise", "l1"]
     assert [row["knows"] for row in results["laws"]] == [
         LAWS[name].model_data for name in ("rise", "l1")

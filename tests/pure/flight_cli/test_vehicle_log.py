@@ -465,7 +465,7 @@ def test_parameters_of_the_samples_count_and_not_the_last_ones(
     assert np.abs(read_run(bag).tape["u"].values - flight.u).max() <= 1e-6
     sentence = (
         "SERVO2_REVERSED changes from 1 to 0 at 37.0 s of the log, after the samples: "
-        "signs and effects are those of 1"
+        "signs and effects apply to 1"
     )
     assert f"warning: {sentence}" in result.stderr
     assert yaml.safe_load((bag / "vehicle_parameters.yaml").read_text())["SERVO2_REVERSED"] == 1.0
@@ -525,7 +525,7 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(
             refused = str(invoke(*arguments).exception)
             assert f"found inputs.elevator.{key} " in refused
             assert refused.endswith(
-                f"expected {value}, that of the map ardupilot: import the log again, with --map"
+                f"expected {value}, as in the map ardupilot: import the log again, with --map"
             )
 
 

@@ -365,7 +365,7 @@ def test_last_model_of_a_run_is_exported_without_learn(flown: Flown, tmp_path: P
     with refusing("controller.learn: found a section, expected none: C code replaces"):
         rise_di.export(chosen, tmp_path, proof=False)
     other = chosen.vary(controller={"ramp": 1.0})
-    with refusing("run: found a flight with other parameters, expected those of"):
+    with refusing("run: found a flight with other parameters, expected the parameters of"):
         with_last_model(other, read_run(flown.run))
 
 

@@ -208,11 +208,11 @@ def test_changes_are_told_with_the_value_of_the_samples() -> None:
     assert change_sentences(recorded, 10 * SECOND, 30 * SECOND, 60 * SECOND) == [
         (
             "SERVO2_REVERSED changes from 1 to 0 at 10.0 s of the log, before the samples: signs "
-            "and effects are those of 0"
+            "and effects apply to 0"
         ),
         (
             "SERVO2_REVERSED changes from 0 to 1 at 55.0 s of the log, after the samples: signs "
-            "and effects are those of 0"
+            "and effects apply to 0"
         ),
     ]
 

@@ -276,7 +276,7 @@ def test_step_that_fails_leaves_last_u_m_and_next_is_tried(
     assert (u_m.values[at[0] : at[2] + 1] == u_m.values[at[0] - 1]).all()
     assert (u_m.values[at[2] + 1] != u_m.values[at[2]]).any()
     notices = [text for text in guidance_notices(tape, section) if "failed" in text]
-    said = "a step of guidance failed, the last u_m goes on"
+    said = "a step of guidance failed, the last u_m is repeated"
     assert notices == [f"guidance at t = {t} s: {said}" for t in ("2.0", "26.0")]
     assert summarise(tape)["guidance"]["failed"] == 4
     replayed = replay_guidance(tape, section)
@@ -317,7 +317,7 @@ def test_steps_that_fail_for_longer_than_the_age_limit_leave_no_u_m(
     held = [k for k in range(50, 250) if outputs[k] is not None]
     assert held == [*range(50, 60)]  # 0.2 s after the last step that did not fail, at 49
     said = [notice for k in held for notice in outputs[k].notices]
-    assert said == [f"a step of guidance failed, the last u_m goes on: {CAUSE}"]
+    assert said == [f"a step of guidance failed, the last u_m is repeated: {CAUSE}"]
     assert made.failed == 200
     assert outputs[250].u_m is not None
     assert made.mode is GuidanceMode.ENGAGED

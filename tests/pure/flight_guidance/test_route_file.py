@@ -539,7 +539,10 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
         (82, "NAV_SPLINE_WAYPOINT is flown as a corner with a fillet, and not as a spline"),
         (
             179,
-            "heights above the home stay above the first home, and not above that of DO_SET_HOME",
+            (
+                "heights above the home stay above the first home, and not above the home of "
+                "DO_SET_HOME"
+            ),
         ),
         (601, "DO_JUMP_TAG repeats items, which are flown once here"),
         (30, "not flown: NAV_CONTINUE_AND_CHANGE_ALT (30) (item 2)"),

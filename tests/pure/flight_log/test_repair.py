@@ -116,7 +116,7 @@ def test_log_that_is_being_recorded_unchanged(run: Path) -> None:
     truncate(run, 0.5)
     with unchanged(run), (run / "run_0.mcap").open("ab") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
-        with refusing("found a recorder that is writing it, expected one that has ended"):
+        with refusing("found a recorder that still writes it, expected a recorder that has ended"):
             repair(run)
 
 

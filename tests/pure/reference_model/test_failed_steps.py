@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Test that y_m goes on and the next step is tried after a failed step of the model."""
+"""Test that y_m is repeated and the next step is tried after a failed step of the model."""
 
 import math
 from typing import Any
@@ -56,7 +56,7 @@ def test_last_y_m_goes_on_and_next_step_is_tried(
         "is not finite": "ArithmeticError a value that is not finite",
     }
     assert [str(failure) for failure in said if failure] == [
-        f"a step of the reference model failed, the last y_m goes on: {cause[kind]}"
+        f"a step of the reference model failed, the last y_m is repeated: {cause[kind]}"
     ]
     assert said[10]
     assert made.failed == 3

@@ -276,7 +276,7 @@ def test_new_gains_change_neither_feedforward_nor_input() -> None:
             {"B": (2.0, 0.4, 0.3, 1.0) + (0.0,) * 4},
             (
                 r"^controller\.feedforward\.B: found a C B with D = \[1, 1\], expected D = \[1, "
-                r"-1\], that of the controller$"
+                r"-1\], the D of the controller$"
             ),
         ),
         (

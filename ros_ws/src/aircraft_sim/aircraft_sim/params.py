@@ -306,7 +306,7 @@ class AircraftConfig(NodeConfig):
             self.drift is None,
             "over_airspeed",
             "a drift beside it",
-            "none: a drift is that of the trim speed",
+            "none: a drift is defined at the trim speed",
         )
 
     def _stops(self) -> dict[str, Sequence[float]]:

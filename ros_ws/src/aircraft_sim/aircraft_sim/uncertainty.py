@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sample uncertain aircraft for Monte Carlo campaigns, repeatable by seed.
 
-A and B are sampled around those of a published airframe.
+A and B are sampled around the matrices of a published airframe.
 """
 
 from collections.abc import Mapping

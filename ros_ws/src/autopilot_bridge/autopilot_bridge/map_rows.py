@@ -118,7 +118,7 @@ class MeasuredRow(Row):
         "`field` is a component of this vector",
     )
     stamp: Literal["header", "arrival"] = Field(
-        description="stamp of the sample: that of the message header, or its arrival"
+        description="stamp of the sample: the stamp in the message's header, or its arrival"
     )
     max_age: Positive = Field(description="the age above which the channel is stale, s")
 

@@ -142,7 +142,7 @@ class ChannelMap(Config):
             not instant_row.held,
             f"outputs.{self.instant}.held",
             "true",
-            "false: its stamp is that of y",
+            "false: it has the stamp of y",
         )
         self._check_fields()
         self._check_topics()
@@ -172,7 +172,10 @@ class ChannelMap(Config):
             )
             owner = owners.setdefault((row.message, row.field), name)
             require(
-                owner == name, f"{key}.field", f"{row.field}, that of {owner}", "a field of its own"
+                owner == name,
+                f"{key}.field",
+                f"{row.field}, the field of {owner}",
+                "a field of its own",
             )
             low, high = row.range
             require(

@@ -141,7 +141,7 @@ HEADER = """/* Axes, signs and sizes of the autopilot for the channels of the sc
 #define RISE_DI_SPEED ((rise_di_real){speed!r}) /* m/s */
 #define RISE_DI_SLOWEST {slowest!r}F
 #define RISE_DI_FASTEST {fastest!r}F
-#define RISE_DI_OBSERVER_PART {part} /* limits of u_o as a fraction of those of u */
+#define RISE_DI_OBSERVER_PART {part} /* limits of u_o as a fraction of the limits of u */
 #define RISE_DI_OBSERVER_SLEW {slew} /* 1/s, largest rate of u_o as a fraction of the limits of u */
 #endif
 """  # noqa: E501 - a text as it is written
@@ -211,7 +211,7 @@ def write_module(
         for source in sorted((SOURCE / part).iterdir()):
             texts[f"{shell.place}/{source.name}"] = source.read_text("utf-8")
     texts[f"{shell.place}/rise_di_axes.h"] = _axes(scenario, "F" if float32 else "")
-    with writing("export", folder, "a folder that can"):
+    with writing("export", folder):
         for name, text in texts.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_file(folder / name, _with_words(text, words))
@@ -263,7 +263,10 @@ def _axes(scenario: Scenario, suffix: str) -> str:
     for name, sign in zip(controller.inputs, exportable(controller).D, strict=True):
         end = upper.get(name) or 0.0
         require(
-            end > 0.0, "aircraft.actuators.upper", f"no end stop of {name}", "that of the torque 1"
+            end > 0.0,
+            "aircraft.actuators.upper",
+            f"no end stop of {name}",
+            "the deflection at a torque of 1",
         )
         per_u.append(f"{float(sign / end)!r}{suffix}")
     speed = channels.speed

@@ -94,7 +94,7 @@ def write_code(
     cannot be written.
     """
     require(samples >= LEAST_SAMPLES, "samples", samples, f"{LEAST_SAMPLES} or more")
-    with writing("c", folder, "a folder that can"):
+    with writing("c", folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name in (REPORT, FMU, CERTIFICATE):
             (folder / name).unlink(missing_ok=True)

@@ -58,10 +58,10 @@ class AircraftOfFleet(Config):
     """An aircraft of a fleet, as the fleet file describes it."""
 
     scenario: str | None = Field(
-        default=None, description="name or path of a scenario; by default that of the fleet"
+        default=None, description="name or path of a scenario; by default the fleet's"
     )
     set: Overrides = Field(
-        default={}, description="parameters in place of those of the scenario, by section"
+        default={}, description="parameters that replace the scenario's, by section"
     )
     start: dict[str, Number] = Field(
         default={}, description="where it is at its t = 0: north, east, m, and heading, rad"

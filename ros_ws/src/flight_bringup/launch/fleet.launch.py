@@ -31,7 +31,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "duration",
                 default_value="",
-                description="flight time of each aircraft, s; empty: that of the file",
+                description="flight time of each aircraft, s; empty: as in the file",
             ),
             watch_argument(),
             runs_argument(),

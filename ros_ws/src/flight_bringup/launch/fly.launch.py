@@ -92,7 +92,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "params_file",
                 default_value="",
-                description="parameter file whose values replace those of the scenario",
+                description="parameter file whose values replace the scenario's",
             ),
             log_level_argument(),
             sim_time_argument(),

@@ -412,5 +412,5 @@ class MonteCarlo:
 
 
 def _write(path: Path, content: str | bytes) -> None:
-    with writing("", path, "a folder and a disk that can"):
+    with writing("", path, "a writable folder and space on the disk"):
         write_file(path, content)

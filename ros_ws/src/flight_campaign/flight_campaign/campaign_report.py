@@ -57,7 +57,7 @@ from flight_core.vectors import FloatArray
 COARSE = PER_DECADE // 50
 WIND_EFFECTS: dict[WindEffect, str] = {
     "air_relative": "by each aircraft's own A",
-    "published": "that of the airframe",
+    "published": "from the airframe file",
 }
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 ENTRIES_SHOWN = 6
@@ -76,7 +76,7 @@ OVERVIEW_LEGEND = (
     "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay "
     "margin: of all inputs at once."
     " Nominal aircraft, and in parentheses the worst found by a search over the box of A and B; "
-    "lags and delay are those of the controller's section. Uniform samples miss the corners of the "
+    "lags and delay come from the controller's section. Uniform samples miss the corners of the "
     "box: the distribution corners flies these, and rise-di gains guarantee bounds every "
     "aircraft"
 )
@@ -103,7 +103,7 @@ def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
     definition = campaign.definition
     tallies = [campaign.tally(case) for case in range(definition.cases)]
     margins = [campaign.margins(case) for case in range(definition.cases)]
-    with writing("", campaign.folder, "a folder and a disk that can"):
+    with writing("", campaign.folder, "a writable folder and space on the disk"):
         cases = []
         for case, (tally, loop_margins) in enumerate(zip(tallies, margins, strict=True)):
             guarantee = campaign.guarantee(case)

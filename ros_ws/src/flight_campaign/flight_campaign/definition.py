@@ -100,7 +100,7 @@ class Definition(Config):
         ge=0, lt=1, description="the largest relative deviation of an entry of A and of B"
     )
     wind: WindEffect = Field(
-        description="whose A the wind acts through: that of each aircraft, or of the airframe"
+        description="whose A the wind acts through: each aircraft's own, or the airframe's"
     )
     seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
     chunk: int = Field(ge=1, le=1_000_000, description="how many aircraft fly at once")

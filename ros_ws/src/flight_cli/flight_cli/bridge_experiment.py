@@ -239,7 +239,7 @@ def _identified(
 
 def _write(folder: Path, files: Mapping[str, str]) -> None:
     """Write YAML files by name into a folder, which is created if it does not exist."""
-    with writing("--write", folder, "a folder that can"):
+    with writing("--write", folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             write_file(folder / f"{name}.yaml", content)

@@ -107,7 +107,7 @@ class Campaign:
         "Largest relative deviation of each entry of A and B, 0 to 1.", default=0.3
     )
     wind: WindEffect | None = rare_option(
-        "Whose A the wind acts through: that of each aircraft, or that of the airframe; by "
+        "Whose A the wind acts through: each aircraft's own, or the airframe's; by "
         "default as in the scenario."
     )
     entry: list[str] | None = rare_option(
@@ -127,7 +127,7 @@ class Campaign:
         "Repeat the campaign with a controller parameter, or its value in one channel, times "
         "each factor: beta=0.5,1,2 or 'beta[V]=0.5,1,2'."
     )
-    duration: float | None = option("Duration of each flight, s; by default that of the scenario.")
+    duration: float | None = option("Duration of each flight, s; by default as in the scenario.")
     chunk: int | None = rare_option(
         "Aircraft computed at once; by default 1000, on a GPU as many as its memory holds, and 4 "
         "with a learner or a route.",

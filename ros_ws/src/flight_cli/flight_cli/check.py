@@ -68,7 +68,7 @@ class Check:
         autocompletion=map_names,
     )
     airframe: str | None = option(
-        "Airframe; by default that of the scenario.", autocompletion=airframe_names
+        "Airframe; by default the one of the scenario.", autocompletion=airframe_names
     )
     scenario: str = option(
         "Scenario that has the controller.", default="osprey_servo", autocompletion=scenario_names

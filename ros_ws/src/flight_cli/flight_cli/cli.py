@@ -60,8 +60,8 @@ GROUPS = MappingProxyType(
         "Design": {
             "airframes": "Show airframes and whether they meet the assumptions of the theorem, or "
             "make one of your own that flies.",
-            "gains": "Select gains for an airframe, check those of a scenario, or bound them for "
-            "every aircraft.",
+            "gains": "Select gains for an airframe, check the gains of a scenario, or bound them "
+            "for every aircraft.",
             "identify": "Identify an aircraft of JSBSim or behind a bridge, and write a scenario "
             "for it, or identify an airframe from a log.",
             "learn": "Run the learner again on the log of a flight, with other settings if you "

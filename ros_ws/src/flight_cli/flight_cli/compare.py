@@ -162,7 +162,7 @@ class Compare:
     )
     seed: int = option("Seed of the uncertain aircraft.", default=1, min=0)
     wind: WindEffect | None = rare_option(
-        "Whose A the wind acts through: that of each aircraft, or that of the airframe; by "
+        "Whose A the wind acts through: each aircraft's own, or the airframe's; by "
         "default as in the scenario."
     )
     laws: str | None = option(
@@ -179,7 +179,7 @@ class Compare:
         default=False,
     )
     turbulence_seed: int = rare_option(
-        "Seed of the turbulence; it must differ from that of the tuning.",
+        "Seed of the turbulence; it must differ from the seed of the tuning.",
         default=law_comparison.TURBULENCE_SEED,
         min=0,
     )
@@ -267,7 +267,7 @@ class Compare:
             console,
             f"{_notes(scenario, benchmark, laws, contest.aims)}\n"
             f"{self.aircraft} aircraft a level, seed {self.seed}; effect of wind on x_dot {effect}"
-            f"; turbulence of seed {self.turbulence_seed}, that of the tuning "
+            f"; turbulence of seed {self.turbulence_seed}, the tuning had "
             f"{gain_tuning.TUNING_TURBULENCE_SEED}",
             style="dim",
         )
@@ -304,7 +304,7 @@ def _check_options(
         "fractions, each at least 0 and below 1: 0.3,0.5",
     )
     differs = turbulence_seed != gain_tuning.TUNING_TURBULENCE_SEED
-    require(differs, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
+    require(differs, "--turbulence-seed", turbulence_seed, "another seed than the tuning has")
 
 
 def _require_one_law(names: Sequence[str], aims: Sequence[str]) -> None:

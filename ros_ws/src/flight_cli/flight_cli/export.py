@@ -66,7 +66,7 @@ class Export:
         "Compute in single precision. The proof then bounds the difference of u.", default=False
     )
     duration: float | None = rare_option(
-        "Duration of each flight of the proof, s; by default that of the scenario, at most 20 s.",
+        "Duration of each flight of the proof, s; by default as in the scenario, at most 20 s.",
         min=1.0,
     )
     drawn: int = rare_option(

@@ -95,7 +95,7 @@ class Fly(RouteWords):
         default="osprey_servo",
         autocompletion=scenario_names,
     )
-    duration: float | None = option("Duration, s; by default that of the scenario.")
+    duration: float | None = option("Duration, s; by default as in the scenario.")
     settings: list[str] | None = settings_option()
     in_process: bool = option("Fly in one process without ROS, as fast as it goes.", default=False)
     lockstep: bool = option(

@@ -154,13 +154,13 @@ class Select(_Gains):
     Exit status: 0, or 2 bad input.
     """
 
-    rate: float | None = rare_option("Rate of the law, Hz; by default that of the scenario.")
+    rate: float | None = rare_option("Rate of the law, Hz; by default as in the scenario.")
     y_rate: float | None = rare_option(
-        "Rate of y, Hz. If its period is longer than that of the law, the difference counts as "
+        "Rate of y, Hz. If its period is longer than the law's, the difference counts as "
         "delay. y is stale after three periods."
     )
     lag: str | None = option("Lags of the actuators in s, in the airframe's order: 0.02,0.1.")
-    delay: float | None = option("Pure delay, s; by default that of the scenario.")
+    delay: float | None = option("Pure delay, s; by default as in the scenario.")
     px4: Path | None = rare_option(
         "Parameter file of QGroundControl or ULog of PX4, which gives the rate and the delay of "
         "the body rates for a module of export --px4."
@@ -186,7 +186,7 @@ class Select(_Gains):
         "schedule between them."
     )
     weights: Path | None = rare_option(
-        "With --observer: file of gains and weights in place of those of a search or a rule. With "
+        "With --observer: file of gains and weights, in place of a search or a rule. With "
         "--accept they are taken as they are."
     )
     phase_margin: float = rare_option(
@@ -375,7 +375,7 @@ def _write_page(path: Path, answer: GainAssessment[Any]) -> None:
     Raises ParameterError for the literal sign, which has no linear loop.
     """
     loop = answer.loop_with_box()
-    with writing("--page", path, "a page that can"):
+    with writing("--page", path, "a writable file"):
         write_loop_page(path, f"Loop of {answer.study.airframe.name}", loop)
 
 

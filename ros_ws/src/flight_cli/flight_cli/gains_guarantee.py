@@ -150,7 +150,7 @@ def write_unstable(
     own = [f"1/{name}" for name in published(base)]
     others = [name for name in guarantee.unstable.entries if name in {*declared} - {*own}]
     require(not others, "worst", ", ".join(others), f"lags of the actuators of {base.name} alone")
-    with writing("--worst", folder, "a folder that can"):
+    with writing("--worst", folder):
         folder.mkdir(parents=True, exist_ok=True)
     least_unstable = guarantee.unstable.deviation
     lines = []

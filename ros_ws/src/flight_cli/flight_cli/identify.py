@@ -203,7 +203,7 @@ class Log:
     scenario: str | None = log_scenario()
     namespace: str | None = log_namespace()
     delay: float | None = option(
-        "Delay of u, s; by default that of the scenario. A flight in one process has none."
+        "Delay of u, s; by default as in the scenario. A flight in one process has none."
     )
     refly: bool = option(
         "Fly the scenario in this process with a feedforward and an observer of the model.",
@@ -299,8 +299,8 @@ class Bridge:
     phase_margin: float = _phase_margin_option()
     accept: bool = _accept_option()
     link_delay: float | None = rare_option(
-        "With a log of rise-di import: delay that the link adds to that in the log, s; by default "
-        "that of the map."
+        "With a log of rise-di import: delay that the link adds to the delay in the log, s; by "
+        "default the delay of the map."
     )
     as_json: bool = json_option()
 

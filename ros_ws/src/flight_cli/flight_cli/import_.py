@@ -103,7 +103,7 @@ class Import:
         source = {"log": self.log.name, "kind": vehicle_log.kind, "map": channel_map.name}
         units = {name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()}
         records = {IMPORTED: {**source, COMPARED: "; ".join(taken.notes)}, CHANNEL_UNITS: units}
-        with writing("--output", folder, "a folder that can"):
+        with writing("--output", folder):
             folder.mkdir(parents=True)
             write_file(
                 folder / PARAMETERS, dump_yaml(dict(sorted(taken.parameters.items())), flow=False)
@@ -137,7 +137,7 @@ def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
     """Write the ticks of a controller that was exported into PX4 as a run of its scenario."""
     module_log = read_foreign_log(log)
     flight = module_flight(module_log, scenario.controller)
-    with writing("--output", folder, "a folder that can"):
+    with writing("--output", folder):
         folder.mkdir(parents=True)
     attachments = attachments_for(scenario, folder)
     with TapeWriter(folder, attachments, flight.tape.start_ns) as writer:

@@ -48,8 +48,8 @@ class Report:
     metadata.yaml. The damaged file is kept as *.damaged. An intact log stays as it is, and
     metadata.yaml of another program is never replaced.
 
-    Exit status: that of the flight (see docs/outcomes.md), or the gravest of several flights; 2 bad
-    input.
+    Exit status: the status of the flight (see docs/outcomes.md), or the gravest of several flights;
+    2 bad input.
     """
 
     runs: list[Path] | None = argument(
@@ -59,7 +59,7 @@ class Report:
         "Page of a comparison; by default in a new folder beside the first run.", "--page"
     )
     output: Path | None = rare_option(
-        "Folder for the report of one run; by default that of its log. Use it for archives."
+        "Folder for the report of one run; by default the folder of its log. Use it for archives."
     )
     png: Path | None = option("PNG file to write, with y over y_m, e and u.")
     csv: Path | None = option(

@@ -78,12 +78,12 @@ class Tune:
     aircraft, the command says which doublets to fly, and which parameter to set.
 
     Several controllers then fly the commands of the scenario on the identified aircraft, in calm
-    air and in gusts: that of the scenario, and those that are selected for this aircraft. The one
+    air and in gusts: the scenario's own, and some that are selected for this aircraft. The one
     with the least errors becomes the module, even if that is the controller that you had.
 
     Exit status: 0; 1 if an aircraft within the errors of the identification may be unstable, or if
-    a result of the C code differs from that of Python in one bit; 2 bad input, a model that is
-    refused, or margins that fall short.
+    a result of the C code differs in one bit from the result of Python; 2 bad input, a model that
+    is refused, or margins that fall short.
     """
 
     log: Path = argument("ULog of PX4, or DataFlash log of ArduPlane.", default=REQUIRED)
@@ -157,7 +157,7 @@ class Tune:
         if len(named) != 1:
             raise typer.BadParameter("expected --px4 FOLDER or --ardupilot FOLDER")
         ((autopilot, folder),) = named.items()
-        with writing(f"--{autopilot}", folder, "a folder that can"):
+        with writing(f"--{autopilot}", folder):
             folder.mkdir(parents=True, exist_ok=True)
         return autopilot, folder
 

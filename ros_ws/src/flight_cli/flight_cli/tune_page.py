@@ -179,7 +179,7 @@ def tuning_page(tuned: Tuned, log: str, autopilot: str) -> Page:
         "Predicted rms of the error along the commands of the scenario",
         [Column(group=name, head="mrad/s") for name in tuned.best.scenario.controller.outputs],
         error_rows(tuned),
-        "with the noise of the log's gyro; gusts: those of a wind of 5 m/s near the ground, "
+        "with the noise of the log's gyro; gusts: a wind of 5 m/s near the ground, "
         "and air that rolls with 0.5 rad/s rms. "
         f"{'. '.join(verdict(tuned))}. The autopilot's own loop: {own}",
     )

@@ -218,7 +218,7 @@ def open_nonblocking(path: str | Path) -> BinaryIO:
 
 
 @contextmanager
-def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
+def writing(key: str, path: str | Path, expected: str = "a writable folder") -> Iterator[None]:
     """Turn an OSError inside the block into a ParameterError.
 
     Its message has `key`, which can be empty, the `path` that cannot be written, and `expected`.

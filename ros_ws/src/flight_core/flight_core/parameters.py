@@ -100,7 +100,9 @@ class Config:
             parameters = cls.read(values, where, problems, check=check)
         except ArithmeticError as error:  # a check of several keys together overflowed
             numbers = f"numbers too large or too small ({error.args[-1]})"
-            raise ParameterError(f"{where}: found {numbers}, expected those of a flight") from None
+            raise ParameterError(
+                f"{where}: found {numbers}, expected numbers of a flight"
+            ) from None
         if parameters is None:
             raise ParameterError(problems.summary())
         return parameters

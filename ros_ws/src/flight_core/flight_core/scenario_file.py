@@ -194,7 +194,7 @@ def _require_one_namespace(own: list[str], name: str, path: Path) -> None:
         len(spaces) < 2,
         f"{path.name}: {name}",
         f"sections in {' and in '.join(spaces)}",
-        "those of one namespace",
+        "sections in one namespace",
     )
 
 

@@ -38,7 +38,7 @@ from flight_guidance.guidance_state import (
 from flight_guidance.modes import modes, targets
 from flight_guidance.multicopter import multicopter
 from flight_guidance.notices import (
-    LAST_GOES_ON,
+    LAST_REPEATED,
     STALE_TIME,
 )
 from flight_guidance.params import GuidanceConfig
@@ -408,7 +408,7 @@ class Guidance:
             return None
         inputs = self._inputs(now_ns, pose, y)._replace(commands={})
         log = self._row(inputs, state, StepCommands(), now_ns)
-        notices = (f"{LAST_GOES_ON}: {cause}",) if is_said else ()
+        notices = (f"{LAST_REPEATED}: {cause}",) if is_said else ()
         return GuidanceOutput(u_m(state), log, notices)
 
     def _row(

@@ -29,7 +29,7 @@ LEARNED = tuple(f"authority.{name}" for name in Authority._fields)
 FAILED = "failed"
 """Channel of `guidance`: number of failed steps."""
 
-LAST_GOES_ON = "a step of guidance failed, the last u_m goes on"
+LAST_REPEATED = "a step of guidance failed, the last u_m is repeated"
 
 LINK_AGE = "age.link"
 """Channel of `guidance`: time since the last message of an operator, s, 0 without a limit."""
@@ -236,5 +236,5 @@ class Notices:
             notices += self.take(instant, dict(zip(self.CHANNELS, row, strict=True)))
         failures = Failures()
         rises = t[np.diff(log[FAILED], prepend=0.0) > 0.0]
-        notices += [Notice(at, LAST_GOES_ON) for at in rises.tolist() if failures.add(at)]
+        notices += [Notice(at, LAST_REPEATED) for at in rises.tolist() if failures.add(at)]
         return sorted(notices, key=lambda notice: notice.t)

@@ -322,7 +322,7 @@ class GuidanceConfig(SteeringConfig):
             number < len(waypoints) - 1,
             "landing.waypoint",
             f"{number} of {len(waypoints)} waypoints",
-            "one before the last, which is that of a go-around",
+            "one before the last, which is the leg of a go-around",
         )
         floor, fastest = self._floor(), self._largest_speed()
         if section.V is not None:

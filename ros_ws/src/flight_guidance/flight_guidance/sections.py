@@ -177,5 +177,5 @@ class LandingConfig(Config):
         default=1.5, description="height below which the nose turns along the line, m; 0: never"
     )
     V: Positive | None = Field(
-        default=None, description="airspeed from the flare on, m/s; none: that of the line"
+        default=None, description="airspeed from the flare on, m/s; none: the airspeed of the line"
     )

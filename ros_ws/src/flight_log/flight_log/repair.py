@@ -21,6 +21,7 @@ from flight_log.bag import CHUNK_BYTES
 from flight_log.disk import try_lock
 from flight_log.open_log import log_files, missing_parts, require_mcap
 from flight_log.rosbag2_metadata import (
+    EXPECTED,
     INFORMATION,
     METADATA,
     FileContents,
@@ -109,7 +110,7 @@ def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
         if not is_file(path):
             return {}, 0
     try:
-        tree = parse_yaml(read_file(path, METADATA, "that of rosbag2"), METADATA, "that of rosbag2")
+        tree = parse_yaml(read_file(path, METADATA, EXPECTED), METADATA, EXPECTED)
     except ParameterError:
         return {}, 0
     foreign = bool(tree) and not (isinstance(tree, Mapping) and INFORMATION in tree)
@@ -117,7 +118,7 @@ def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
         not foreign,
         str(path),
         "a file of another program",
-        "that of rosbag2, or none: move it elsewhere",
+        f"{EXPECTED}, or no such file: move it elsewhere",
     )
     return {}, 0
 
@@ -128,7 +129,10 @@ class _FileScan:
     def __init__(self, path: Path) -> None:
         with path.open("rb") as stream:
             require(
-                try_lock(stream), str(path), "a recorder that is writing it", "one that has ended"
+                try_lock(stream),
+                str(path),
+                "a recorder that still writes it",
+                "a recorder that has ended",
             )
         self.path = path
         self.schemas: dict[int, Schema] = {}
@@ -186,7 +190,7 @@ class _FileScan:
             for identity, count in self.messages.items()
             if identity in self.channels
         }
-        require(bool(counts), str(self.path), "no message that could be read", "any")
+        require(bool(counts), str(self.path), "no message that could be read", "at least one")
         with replacing(self.path) as stream:
             self._copy(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD))
             stream.flush()

@@ -20,7 +20,7 @@ from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING, learning_me
 from flight_log.named_vectors import JOINT_STATE, Samples, encoded
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_event
 
-EXPECTED = "a folder and a disk that can"
+EXPECTED = "a writable folder and space on the disk"
 
 DELAY_NS = NANOSECONDS
 """Longest time by which a sample may come late, ns. Samples of the last DELAY_NS are written with

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decode the logs of autopilots, and find the system, the sensors and the clock of the flight.
 
-Sources: those of `vehicle_log`; MAVLink, common.xml (time_boot_ms), MAVLink guide, Serialization
+Sources: as in `vehicle_log`; MAVLink, common.xml (time_boot_ms), MAVLink guide, Serialization
 (the sequence of a link).
 """
 

@@ -58,7 +58,7 @@ class FlightBag:
         )
         default = f"runs/{datetime.now(UTC):%Y%m%dT%H%M%SZ}-recording"
         directory = Path(parameters.directory or default).absolute()
-        with writing("recorder.directory", directory, "a folder that can"):
+        with writing("recorder.directory", directory):
             directory.mkdir(parents=True, exist_ok=True)
             if shortage := self._space_shortage(directory):
                 raise ParameterError(f"recorder.min_free: {shortage}")

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warn of silences, in which no message of a topic comes any more although the flight goes on.
 
-A silence can be that of a single topic, or of y, y_m and u together.
+A single topic can be silent, or y, y_m and u together.
 """
 
 import sys

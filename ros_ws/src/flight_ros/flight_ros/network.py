@@ -54,7 +54,7 @@ def own_address(peers: Sequence[str], local: Collection[str]) -> str:
         len(matches) == 1,
         "--peers",
         f"{len(matches)} addresses of this host ({own})",
-        "one of them, and those of the other hosts",
+        "one of them, and the addresses of the other hosts",
     )
     return matches[0]
 

@@ -516,7 +516,7 @@ class Control:
         name = self._map()
         require_form(
             request.get("map") == name,
-            f"map: found {short_repr(request.get('map'))}, expected {name}, that of the bridge",
+            f"map: found {short_repr(request.get('map'))}, expected {name}, the map of the bridge",
         )
         return self._link.engage()
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validate the parameters of the reference model, and convert them to arrays.
 
-The arrays are those of the model and of the profile of commands.
+The arrays belong to the model and to the profile of commands.
 """
 
 import math

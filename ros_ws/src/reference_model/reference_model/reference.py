@@ -19,7 +19,7 @@ from reference_model.command import command
 from reference_model.live import Live
 from reference_model.params import ReferenceModelConfig
 
-LAST_GOES_ON = "a step of the reference model failed, the last y_m goes on"
+LAST_REPEATED = "a step of the reference model failed, the last y_m is repeated"
 
 BLOCK = 100  # number of steps for which the profile is evaluated at once
 
@@ -89,7 +89,7 @@ class Reference:
                 self._x_m, self._applied, self._live = self._stepped(tracked)
             except Exception as error:  # after any error, the next step is tried
                 if self._failures.add(seconds(self._number * self.period_ns)):
-                    self._failure = Refusal(f"{LAST_GOES_ON}: {sentence(error)}")
+                    self._failure = Refusal(f"{LAST_REPEATED}: {sentence(error)}")
             self._number += 1
         y_m: FloatArray = model.output(self._x_m, self._model)
         return y_m

@@ -99,7 +99,7 @@ def export(
             the scenario learns, the last model of this flight is exported instead, and the proof
             has its own flights and random inputs.
         float32: Whether to compute in single precision. The proof then bounds the difference of u.
-        duration: Duration of each flight of the proof, s. If None, it is that of the scenario, at
+        duration: Duration of each flight of the proof, s. If None, it is the scenario's, at
             most 20 s.
         drawn: Number of random steps in the proof. There are none in single precision, or if the
             ticks of `run` are used.
@@ -145,7 +145,7 @@ def export(
         files.append(build_fmu(code, commands[0], controller, title, folder / FMU, units))
     stated = _certified(source, code / PARAMETERS)
     if stated is not None:
-        with writing("c", folder, "a folder that can"):
+        with writing("c", folder):
             write_file(folder / CERTIFICATE, stated[0])
         files.append(folder / CERTIFICATE)
     if not proof:
@@ -162,7 +162,7 @@ def export(
     text = proof_report(proved, title) + material.line
     if stated is not None:
         text = stated[1] + text
-    with writing("c", folder, "a folder that can"):
+    with writing("c", folder):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)
 
@@ -289,7 +289,7 @@ def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -
     """
     sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
     same = sets[0].digest() == controller.digest()
-    require(same, "run", "a flight with other parameters", f"those of {title}")
+    require(same, "run", "a flight with other parameters", f"the parameters of {title}")
     line = f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
     return Material(sets, iter([recording]), line)
 

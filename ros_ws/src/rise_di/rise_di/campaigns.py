@@ -85,12 +85,12 @@ def fly_campaign(
         distribution: Distribution of the deviations: "uniform", "normal" with three standard
             deviations at the limit, or "corners".
         score: Units of the rms errors in the score by output, SI, as in {"q": 0.02}.
-        wind: The A through which the wind acts: that of each aircraft for "air_relative", or that
-            of the airframe for "published". If None, the scenario decides.
+        wind: The A through which the wind acts: each aircraft's own for "air_relative", or the
+            airframe's for "published". If None, the scenario decides.
         seed: Seed of the aircraft.
         sweep: A parameter of the controller, or its value in one channel, and factors for it, as in
             {"beta[V]": [0.5, 1.0, 2.0]}.
-        duration: Duration of each flight, s. If None, it is that of the scenario.
+        duration: Duration of each flight, s. If None, it is the scenario's.
         chunk: Number of aircraft computed at once. If None, it is 4 with a learner or a route, on a
             GPU as many as fit into its memory, and otherwise 1000.
         workers: Number of threads, or of processes with a learner or a route. If None, there is one

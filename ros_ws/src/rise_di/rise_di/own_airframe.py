@@ -154,7 +154,7 @@ def new_airframe(
     with tempfile.TemporaryDirectory() as trial:
         (Path(trial) / files[0].name).write_text(text_of_airframe, encoding="utf-8")
         scenario, shortfall = _flying(airframe, Path(trial) / files[0].name, files, lags)
-    with writing("folder", place, "a folder that can"):
+    with writing("folder", place):
         place.mkdir(parents=True, exist_ok=True)
         if not source_is_target:
             write_file(files[0], text_of_airframe)

@@ -113,7 +113,7 @@ class AnyLaw(ControllerConfig):
             raise ParameterError(f"{where}.{error}") from None
         default_fields = {} if name == DEFAULT else schema(DEFAULT).model_fields
         names = [key for key in config.model_fields if key not in ControllerConfig.model_fields]
-        expected = f"those of {name}: {', '.join(names) or 'none'}"
+        expected = f"keys of the law {name}: {', '.join(names) or 'none'}"
         for key in values:
             foreign = key in default_fields and key not in config.model_fields
             require(not foreign, f"{where}.{key}", f"a parameter of {DEFAULT}", expected)

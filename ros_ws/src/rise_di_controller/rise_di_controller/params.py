@@ -131,8 +131,8 @@ class ControllerConfig(ControllerSection):
         if self.observer is not None:
             if nominal is None:
                 raise ParameterError(
-                    "observer: found no feedforward beside it, expected that section too: it "
-                    "has the model"
+                    "observer: found no feedforward beside it, expected the section feedforward, "
+                    "which has the model"
                 )
             yield from self._check_observer(self.observer, nominal)
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute an airframe at other airspeeds than the trim speed.
 
-Its A, B and trim are those of level flight at the same altitude. The entries of A and B follow
+Its A, B and trim hold in level flight at the same altitude. The entries of A and B follow
 powers of the airspeed, and the trim is integrated over the airspeed.
 """
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the matrices of an aircraft against the laws of physics.
 
-The laws are those of kinematics, gravity, trim speed, and the sign and the size of a control. The
+The laws concern kinematics, gravity, trim speed, and the sign and the size of a control. The
 name of a state says which quantity it is: V, u, v, w are speeds; alpha, beta, theta, phi, psi are
 angles; p, q, r are angular rates; h and altitude are heights. The axes are FRD. A state of any
 other name is not checked, but VT and other spellings of these names are refused. Source of the

@@ -443,7 +443,7 @@ def _avl_derivatives(
         B[5:7, k] = qS * b * inverse @ np.array([roll, yaw])
     units = _states({}, ["V", "alpha", "q", "theta", "beta", "p", "r", "phi"], 8)
     channels = _inputs({name: inputs.get(name) or "deg" for name in controls}, (), len(controls))
-    note = "AVL's stability derivatives, without those of alpha_dot"
+    note = "AVL's stability derivatives, without the ones by alpha_dot"
     return ToolModel(units, channels, A, B, speed=V0, note=note)
 
 

@@ -29,10 +29,8 @@ class EulerKinematics(NamedTuple):
 
     select: Array  # (5, n), picks phi, theta, p, q, r
     into: Array  # (n, 3), adds the terms to alpha_dot, phi_dot, theta_dot
-    linear: (
-        # (3, n), rows of A that are replaced: none for alpha_dot, the rows of phi_dot and theta_dot
-        Array
-    )
+    # (3, n), rows of A that are replaced: none for alpha_dot, the rows of phi_dot and theta_dot
+    linear: Array
     turn_rate: Array  # () g/V0, 1/s
 
 

@@ -410,13 +410,13 @@ def check_together(scenario: Scenario) -> None:
         not missing,
         "controller.observer.vanes.channels",
         ", ".join(controller.vanes),
-        "those of aircraft.vanes.channels",
+        "channels in aircraft.vanes.channels",
     )
     require_channels(
         "reference_model.outputs",
         reference.outputs,
         controller.outputs,
-        "those of controller.outputs",
+        "the outputs in controller.outputs",
     )
     control_ns = period_ns(controller.rate, "controller.rate")
     for key, rate in (

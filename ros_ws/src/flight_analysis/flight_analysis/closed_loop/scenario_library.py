@@ -169,6 +169,6 @@ def save_scenario(scenario: Scenario, path: Path) -> Scenario:
 
     Raises ParameterError if the file cannot be written.
     """
-    with writing("", path, "a folder that can"):
+    with writing("", path):
         write_file(path, scenario_yaml(scenario))
     return load_scenario(path)

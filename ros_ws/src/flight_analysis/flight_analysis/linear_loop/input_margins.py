@@ -415,8 +415,8 @@ def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
 def _crossings(values: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
     """Find the changes of sign along the second axis of `values`, (N, F, m).
 
-    Returns three indices for each change: that of the aircraft, that of the last frequency before
-    the change, and that of the input.
+    Returns three indices for each change: the index of the aircraft, of the last frequency before
+    the change, and of the input.
     """
     return np.nonzero(np.signbit(values[:, :-1]) != np.signbit(values[:, 1:]))  # type: ignore[return-value]
 

@@ -537,13 +537,13 @@ def is_literal(controller: ControllerConfig) -> bool:
 
 
 def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:
-    """Return the indices of a law's outputs and inputs among those of an airframe.
+    """Return the indices of a law's outputs and inputs among an airframe's.
 
     Raises ParameterError if the airframe lacks any of them.
     """
     for key, known in (("outputs", airframe.outputs), ("inputs", tuple(airframe.inputs))):
         names = getattr(controller, key)
-        expected = f"those of {airframe.name}: {', '.join(known)}"
+        expected = f"{key} of {airframe.name}: {', '.join(known)}"
         require(set(names) <= set(known), f"controller.{key}", ", ".join(names), expected)
     columns = [list(airframe.inputs).index(name) for name in controller.inputs]
     return [airframe.outputs.index(name) for name in controller.outputs], columns

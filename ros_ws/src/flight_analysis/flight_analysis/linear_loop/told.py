@@ -84,7 +84,7 @@ class Standing(Enum):
 
 
 MEANING = {
-    Standing.TAKEN: "margins and guarantee are those of the aircraft",
+    Standing.TAKEN: "margins and guarantee apply to the aircraft",
     Standing.LEFT_OUT: "the margins are without it, and no guarantee is stated",
     Standing.NO_LOOP: "neither margins nor a guarantee are stated",
 }
@@ -262,7 +262,7 @@ def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Differenc
         )
         differences.append(Difference(fact, Standing.NO_LOOP))
     if not flight.has_parameters:
-        fact = "parameters of the controller: those that flew are not those of the file"
+        fact = "parameters of the controller: the flight had other ones than the file"
         differences.append(Difference(fact, Standing.NO_LOOP))
     return differences
 

@@ -113,7 +113,7 @@ def _guarantee_card(guarantee: Guarantee | None, command: str) -> Card:
         (
             "The numbers of the aircraft's model, A and B, may be wrong: the linear loop is proved "
             f"stable for every aircraft whose entries differ by up to "
-            f"{proved_percent(guarantee.stable)} from those of the file{late}."
+            f"{proved_percent(guarantee.stable)} from the entries of the file{late}."
         ),
         found,
         (

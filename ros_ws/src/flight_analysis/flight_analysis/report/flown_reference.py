@@ -56,7 +56,7 @@ class NotCompared(Enum):
     """The reason why y_m was not compared with the scenario."""
 
     ABSENT = "the log has no y_m"
-    FOREIGN = "y_m is of another reference model than that of the stack"
+    FOREIGN = "y_m comes from a reference model outside of the stack"
     OTHER_CHANNELS = "y_m lacks a channel of the scenario's reference model"
     NO_START = "the log does not hold the start of the reference model"
 
@@ -138,7 +138,7 @@ def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
     start = float(errors.t[rows[0]])
     stop = float(errors.t[rows[-1]])
     size_shown = f"{plain_number(size * unit.factor)} {unit.unit}"
-    brief = f"y_m is not that of the scenario: {name} off by {size_shown}"
+    brief = f"y_m differs from the scenario's: {name} off by {size_shown}"
     sentence = f"{brief} at most, from t = {start:.1f} to {stop:.1f} s"
     figures = {"output": name, "start": start, "stop": stop, "largest": size}
     return [Shortfall(aim=Aim.REFERENCE, sentence=sentence, brief=brief, figures=figures)]

@@ -85,9 +85,9 @@ GLOSSARY = MappingProxyType(
         "disk": "the size of the disk of gains and phases around 1 that the loop withstands at "
         "this input; from 0, none, to 2",
         "delay": "how much later u may come before the loop is unstable",
-        "all inputs": "a disk of its own in each input at the same time; phase and gain are those "
-        "that it guarantees, and the delay is that of all inputs together",
-        "damping": "that of the slow modes of the loop",
+        "all inputs": "a disk of its own in each input at the same time; phase and gain are the "
+        "margins that it guarantees, and the delay is the margin of all inputs together",
+        "damping": "the damping ratio of the slow modes of the loop",
         "linear loop": "the law and the aircraft of the file for small deviations, sampled, "
         "with actuators, delay and hold",
     }

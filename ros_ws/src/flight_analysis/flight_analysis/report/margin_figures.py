@@ -188,8 +188,8 @@ def flown_margin_table(flown: FlownLoops) -> MetricTable:
         for loop in flown.loops
     ]
     note = (
-        "Phase, gain and S are those of the worst input, and disk and delay those of all inputs at "
-        "once. The aircraft is that of the file, or the true one as simulated before a drift"
+        "Phase, gain and S belong to the worst input, and disk and delay to all inputs at "
+        "once. The aircraft is the one of the file, or the true one as simulated before a drift"
     )
     note = ". ".join([*flown.sentences, note])
     return MetricTable("Margins of the linear loop, by the parameters in use", columns, rows, note)

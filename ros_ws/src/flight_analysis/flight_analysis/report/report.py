@@ -159,7 +159,7 @@ def _comparison_folder(first: Path) -> Path:
     folder = first.absolute().parent
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-comparison"
     for name in chain([stem], (f"{stem}-{number}" for number in count(2))):
-        with writing("runs", folder, "a folder that can"), suppress(FileExistsError):
+        with writing("runs", folder), suppress(FileExistsError):
             (folder / name).mkdir()
             return folder / name
     raise AssertionError("the names go on for ever")  # for mypy

@@ -42,7 +42,7 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}{scenario.name}"
     for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
         run = (runs / name).absolute()
-        with writing("runs", runs, "a folder that can"), suppress(FileExistsError):
+        with writing("runs", runs), suppress(FileExistsError):
             run.mkdir(parents=True)
             return run
     raise ParameterError(f"runs: found 99 runs in {runs} that began in this second, expected fewer")
@@ -89,7 +89,7 @@ def attachments_for(
 
 
 def _write(path: Path, text: str | bytes) -> Path:
-    with writing("", path, "a folder and a disk that can"):
+    with writing("", path, "a writable folder and space on the disk"):
         write_file(path, text)
     return path
 

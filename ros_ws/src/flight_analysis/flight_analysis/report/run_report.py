@@ -76,7 +76,7 @@ def rewrite_report(
         flight = flight_of(recorded, run)
     except UnflownError as error:
         summary = empty_summary(scenario_in(recorded, run), error.outcome)
-        with writing("", folder, "a folder that can"):
+        with writing("", folder):
             folder.mkdir(parents=True, exist_ok=True)
             _write_summary(folder, summary)
         raise
@@ -102,7 +102,7 @@ def _written(
 
     result = FlightResult(flight, min(bag_files(run), default=folder), folder / REPORT)
     try:
-        with writing("", folder, "a folder that can"):
+        with writing("", folder):
             folder.mkdir(parents=True, exist_ok=True)
             if kept_scenario is not None:
                 _write_scenario(recorded, folder / kept_scenario.path.name)
@@ -121,7 +121,7 @@ def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict
     The log does not change. Raises ParameterError if the file cannot be written.
     """
     summary = empty_summary(scenario, outcome)
-    with writing("", run, "a folder that can"):
+    with writing("", run):
         _write_summary(run, summary)
     link_latest(run)
     return summary
@@ -151,7 +151,7 @@ def _write_scenario(recorded: RecordedRun, path: Path) -> None:
     if recorded.scenario is None:
         return
     if path.is_symlink() or not path.exists():
-        with writing("", path.parent, "a folder that can"):
+        with writing("", path.parent):
             write_file(path, recorded.scenario.content)
         return
     require(

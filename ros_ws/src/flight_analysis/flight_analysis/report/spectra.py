@@ -36,8 +36,8 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
 def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, FloatArray]:
     """Return the frequencies, Hz, and the one-sided power spectral density of each column, (F, m).
 
-    The result equals that of `scipy.signal.welch`. SciPy's function is not used, because loading it
-    takes half a second, a tenth of the time of a whole flight in one process.
+    The result equals the result of `scipy.signal.welch`. SciPy's function is not used, because
+    loading it takes half a second, a tenth of the time of a whole flight in one process.
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
     # (parts, m, window)

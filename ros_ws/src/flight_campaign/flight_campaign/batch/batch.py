@@ -3,8 +3,8 @@
 """Vectorised Monte Carlo simulation: N uncertain aircraft fly one course under any law.
 
 The course is the reference, the wind, the sensor errors and the feedforward that all aircraft
-share. The closed loop is that of the simulation in a single process. The last axis of every array
-is the aircraft, so one line of a law or of the actuators acts on all aircraft.
+share. The closed loop is the same as in the simulation in a single process. The last axis of every
+array is the aircraft, so one line of a law or of the actuators acts on all aircraft.
 """
 
 from collections.abc import Mapping, Sequence

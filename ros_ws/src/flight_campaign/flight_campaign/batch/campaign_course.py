@@ -144,7 +144,7 @@ IDLE_CONTROLLER = frozenset(
 """Keys of a controller that have no effect in a campaign."""
 
 
-ONE_AT_A_TIME = "flights of many at once do not have it, those of rise-di fly do"
+ONE_AT_A_TIME = "flights of many at once do not have it, flights of rise-di fly do"
 
 
 def require_flyable(scenario: Scenario) -> None:
@@ -402,8 +402,8 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
     forced = plant_model.forcing(
         0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect))
     )
+    # Simpson's rule, as in Runge-Kutta.
     wind, timed = (
-        # Simpson's rule, as in Runge-Kutta.
         _Forcing((part[:-1:2] + 4.0 * part[1::2] + part[2::2]) / 6.0, part[: -1 : 2 * steps])
         for part in forced
     )

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convert gains that were tuned in a comparison to the controller of a scenario.
 
-The controller is that of the registered law with the same equations.
+The controller has the registered law with the same equations.
 """
 
 from typing import Any

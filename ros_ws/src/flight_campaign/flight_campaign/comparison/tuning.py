@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tune every law by one procedure: CMA-ES over the logarithms of its gains.
 
-The flights are those of the nominal aircraft and of uncertain aircraft around it.
+The nominal aircraft flies, and uncertain aircraft around it.
 """
 
 import os

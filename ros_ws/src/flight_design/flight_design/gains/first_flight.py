@@ -80,7 +80,7 @@ def first_flight(
         for k, axis in enumerate(crosswise)
     }
     with_gusts = ", gusts" if gusts else ""
-    assumed = "put those of your aircraft here, then select the gains again:"
+    assumed = "put your aircraft's own here, then select the gains again:"
     heading = [
         str(shortfall or ""),
         f"The airframe {airframe.name} at {V0:.6g} m/s: every channel, servos, noise{with_gusts}.",

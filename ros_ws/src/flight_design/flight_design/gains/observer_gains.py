@@ -46,8 +46,8 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
         K = 0.026 / T,  Lambda = K / 4,  beta = K / T,  softening = 3
 
     With these, the softened sign has the half-width eps = 3 units of y. The noise of the wind is
-    0.12 times that of Dryden's model, sqrt(2 V0 / L) sigma. The time constant of the wind is 17
-    times that of Dryden's model, L / V0.
+    0.12 times the one of Dryden's model, sqrt(2 V0 / L) sigma. The time constant of the wind is 17
+    times the one of Dryden's model, L / V0.
 
     `axes` are the axes of the wind in the order of the model's columns, and `speed` is V0, m/s.
     """

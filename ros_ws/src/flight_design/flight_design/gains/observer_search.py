@@ -326,7 +326,7 @@ class ObserverSearch(NamedTuple):
         if self.others and lack is None:
             return ParameterError(
                 "speeds: found less than the margins at another speed, expected speeds nearer to "
-                "that of the trim"
+                "the trim speed"
             )
         uncertain = (
             f"of {WORST_OF} uncertain aircraft: found a phase margin below "

@@ -59,7 +59,7 @@ FURTHER_STARTS = (
 )
 CHEAPER = ((-1, 0), (0, -1), (1, -1), (2, -1), (-3, 1))
 MOVES = Moves(mending=(*CHEAPER, (-1, 1), (1, 0), (0, 1)), cheaper=CHEAPER)
-"""Moves of the two exponents of a channel: a is that of `slower`, and b is that of `lower`. The
+"""Moves of the two exponents of a channel: a belongs to `slower`, and b to `lower`. The
 error after a slow disturbance is proportional to slower lower^2, so only moves with a + 2 b <= 0
 can lower the cost."""
 
@@ -264,7 +264,8 @@ class _Measured(NamedTuple, Generic[Controller]):
 class _Loops(Generic[Controller]):
     """The loops of a search, each built and assessed once.
 
-    A place is a point of the search: the exponents of `slower`, followed by those of `lower`.
+    A place is a point of the search: the exponents of `slower`, followed by the exponents of
+    `lower`.
     """
 
     def __init__(

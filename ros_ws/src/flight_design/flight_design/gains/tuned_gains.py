@@ -107,6 +107,6 @@ def save(
     text = yaml.dump(
         {"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160
     )
-    with writing("", path, "a file of tuned gains that can"):
+    with writing("", path, "a writable file of tuned gains"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, head + text)

@@ -105,10 +105,8 @@ class IdentifiedAircraft(NamedTuple):
     coupling: float
     selection: Selection
     text: str  # text of the scenario file
-    sideslip_zero: (
-        # 1/s, growth rate of sideslip while p and r are held; if positive, Assumption 3 fails
-        float
-    )
+    # 1/s, growth rate of sideslip while p and r are held; if positive, Assumption 3 fails
+    sideslip_zero: float
     flights: dict[str, ManoeuvreResult]  # results by air: "calm", "gust", "turbulence"
 
     @property

@@ -552,16 +552,16 @@ def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> Non
     if source is None:
         return
     key = str(recorded.path or "the log")
-    again = f"that of the map {channel_map.name}: import the log again, with --map"
+    again = f"as in the map {channel_map.name}: import the log again, with --map"
     maps = [stored.content for stored in recorded.attachments if stored.name != PARAMETERS]
-    require(len(maps) == 1, key, f"{len(maps)} maps in the log", "the one of the import")
+    require(len(maps) == 1, key, f"{len(maps)} maps in the log", "only the map of the import")
     content = parse_yaml(maps[0], key, "a channel map")
     before = _rows_of_import(ChannelMap.validate_mapping(content, key))
     for name, value in _rows_of_import(channel_map).items():
         require(
             before.get(name) == value,
             key,
-            f"{name} {before.get(name)} of the map of the import",
+            f"{name} {before.get(name)} in the map of the import",
             f"{value}, {again}",
         )
 

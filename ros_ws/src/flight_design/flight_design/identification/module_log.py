@@ -78,7 +78,7 @@ class _Ticks:
             f"y[{m}]" not in table.fields,
             STATUS,
             f"more than {m} channels",
-            f"those of the scenario: {', '.join(controller.outputs)}",
+            f"the channels of the scenario: {', '.join(controller.outputs)}",
         )
         digests = np.unique(table.fields["parameters"])
         same = len(digests) == 1 and digests[0] == controller.digest()
@@ -86,7 +86,7 @@ class _Ticks:
             same,
             f"{STATUS}.parameters",
             ", ".join(f"{digest:012x}" for digest in digests.astype(np.int64)),
-            f"{controller.digest():012x}, those of the scenario of the export",
+            f"{controller.digest():012x}, the digest of the exported scenario",
         )
         self._controller = controller
         self._now_ns = table.stamp_ns
@@ -177,7 +177,7 @@ class _Ticks:
     def _limits(self, k: int) -> dict[str, tuple[float, ...]]:
         """Return the limits of u in the tick k.
 
-        For each input, the narrower limits are taken: those in the scenario, or those of a torque
+        For each input, the narrower limits are taken: the limits in the scenario, or a torque
         of 1.
         """
         end = self._values["u_end"][k]

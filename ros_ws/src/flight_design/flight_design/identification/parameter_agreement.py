@@ -276,7 +276,7 @@ def change_sentences(recorded: Parameters, start_ns: int, first_ns: int, last_ns
                     else ("after", before.value)
                 )
                 outside.append(
-                    f"{change}, {side} the samples: signs and effects are those of {value:g}"
+                    f"{change}, {side} the samples: signs and effects apply to {value:g}"
                 )
     require(
         not between,

@@ -78,7 +78,10 @@ def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
         require(output in by_motion, "controller.outputs", output, expected)
         end = upper.get(name) or 0.0
         require(
-            end > 0.0, "aircraft.actuators.upper", f"no end stop of {name}", "that of the torque 1"
+            end > 0.0,
+            "aircraft.actuators.upper",
+            f"no end stop of {name}",
+            "the deflection at a torque of 1",
         )
         row = by_motion[output]
         signed = 1 if row.sign * sign > 0 else -1

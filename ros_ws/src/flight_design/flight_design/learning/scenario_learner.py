@@ -182,7 +182,7 @@ def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float]
     if controller.schedule is None:
         return None
     V0 = controller.schedule.speed
-    expected = f"{airframe.speed:g} m/s, that of the model"
+    expected = f"{airframe.speed:g} m/s, the speed of the model"
     require(airframe.speed == V0, "controller.schedule.speed", f"{V0:g} m/s", expected)
     slow, fast = controller.schedule.models
     return slow.ratio, fast.ratio
@@ -326,7 +326,7 @@ def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
     start = scenario.rise_di()
     recorded = recorded_parameters(run.scenario_file())
     same = recorded.digest() == start.digest()
-    require(same, "run", "a flight with other parameters", f"those of {scenario.name}")
+    require(same, "run", "a flight with other parameters", f"the parameters of {scenario.name}")
     flown = recorded
     for change in recorded_changes(run, start):
         flown = vary(flown, change)

@@ -54,7 +54,7 @@ COMMANDS = {
 }
 MEANINGS = {
     82: "NAV_SPLINE_WAYPOINT is flown as a corner with a fillet, and not as a spline",
-    179: "heights above the home stay above the first home, and not above that of DO_SET_HOME",
+    179: "heights above the home stay above the first home, and not above the home of DO_SET_HOME",
     601: "DO_JUMP_TAG repeats items, which are flown once here",
 }
 # Commands after which an autopilot flies no further item: endless loiter, return and landings.

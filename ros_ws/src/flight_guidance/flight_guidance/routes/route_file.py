@@ -364,7 +364,7 @@ class _Heights:
             return self._fixed if altitude is None else altitude
         altitude = _number(place.key, altitude, "altitude")
         if above is Above.GROUND:
-            way_out = "absolute, or --altitude with the height of the ground: that is not known"
+            way_out = "absolute, or --altitude with the height of the ground, which is not known"
             require(self._fixed is not None, place.key, place.altitude_text, way_out)
             return altitude + (self._fixed or 0.0)
         if above is Above.SEA and self._above_sea:
@@ -374,13 +374,13 @@ class _Heights:
             above is Above.HOME or self._sea is not None,
             place.key,
             reference,
-            "that of the home in the file",
+            "a home with its altitude in the file",
         )
         require(
             self._zero is not None,
             place.key,
             reference,
-            "--altitude with that of the home, as the aircraft counts",
+            "--altitude with the altitude of the home, as the aircraft counts",
         )
         above_home = altitude + (self._zero or 0.0)
         return above_home - (self._sea or 0.0) if above is Above.SEA else above_home

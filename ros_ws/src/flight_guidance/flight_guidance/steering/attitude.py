@@ -16,7 +16,7 @@ YAW_TO_BANK = 1.5
 0.02 rad/s, and at 0.004 rad/s in the worst case if A and B are 30 % off."""
 
 SKIDDING = 1.6
-"""Bank of the osprey in a turn by the rudder, divided by that of a coordinated turn at the same
+"""Bank of the osprey in a turn by the rudder, divided by the bank of a coordinated turn at the same
 rate. It is above 1 because the sideslip rolls the aircraft further, and 1.3 to 1.7 if A and B are
 30 % off."""
 

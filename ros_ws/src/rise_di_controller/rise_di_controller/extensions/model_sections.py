@@ -60,7 +60,7 @@ def require_same_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
         signs_of_model == list(D),
         where,
         f"a C B with D = {signs_of_model}",
-        f"D = {list(D)}, that of the controller",
+        f"D = {list(D)}, the D of the controller",
     )
 
 
@@ -129,7 +129,7 @@ class VanesConfig(Config):
     channels: Names = Field(
         description="channels of y that are also states of the feedforward, such as alpha"
     )
-    H: Numbers = Field(description="H z = reading minus that of the reference, one row per vane")
+    H: Numbers = Field(description="H z = reading minus the reference's reading, one row per vane")
     L: Numbers = Field(
         description="added to L for each vane: one row per estimate, columns for outputs and vane"
     )

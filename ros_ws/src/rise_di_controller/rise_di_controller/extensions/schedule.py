@@ -27,8 +27,8 @@ SCALE_RANGE = (0.3, 3.0)
 
 TORQUE_SPEEDS = (0.6, 1.6)
 """Airspeeds as fractions of the trim speed. The torque that an exported module gives for a u
-follows the dynamic pressure only between these airspeeds, which lie within those of
-SCALE_RANGE."""
+follows the dynamic pressure only between these airspeeds, which lie within the
+airspeeds of SCALE_RANGE."""
 
 # Number of steps of the model per unit of V / V0. At 25 m/s the model changes every 0.2 m/s, so
 # that most ticks find their model in the cache.

@@ -40,7 +40,8 @@ class ProbeConfig(Config):
         "p, q, r, else 0",
     )
     lowest: Positive = Field(
-        default=1.5, description="lowest frequency of a sine, Hz, above those of guidance commands"
+        default=1.5,
+        description="lowest frequency of a sine, Hz, above the frequencies of guidance commands",
     )
     window: Annotated[float, Field(ge=2, le=60)] = Field(
         default=6.0, description="time over which the response is measured, s"

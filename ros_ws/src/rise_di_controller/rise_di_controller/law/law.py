@@ -223,7 +223,8 @@ def step_with_anti_windup(
         change = abs(change of u by the increment of Pi)
         Pi+    = Pi + (max(change - excess, 0) / change) * increment of Pi
 
-    Without saturation every bit equals that of the law alone. Theorem 1 does not cover saturation.
+    Without saturation every bit is the same as with the law alone. Theorem 1 does not cover
+    saturation.
     """
     xp = array_namespace(y)
     after, u = step(state, y, y_m, dt, params)

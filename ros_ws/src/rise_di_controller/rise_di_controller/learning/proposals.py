@@ -329,11 +329,11 @@ class Learning:
         if proposal.start != self._digest:
             return Refusal(
                 f"found a proposal for the parameters {proposal.start}, expected "
-                f"{self._digest}, those of the initial parameters"
+                f"{self._digest}, the digest of the initial parameters"
             )
         if self._simulated:
             is_due = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
-            late = f"found {window}, expected that of an identification that is due, once"
+            late = f"found {window}, expected the window of an identification that is due, once"
             return None if is_due else Refusal(late)
         longest = nanoseconds(self._settings.window)
         if self._since_ns is not None:
@@ -346,7 +346,7 @@ class Learning:
             )
         if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
             later = (
-                f"one that ends at least {seconds(self._spacing_ns):g} s after that of the "
+                f"one that ends at least {seconds(self._spacing_ns):g} s after the window of the "
                 "last proposal"
             )
             return Refusal(f"found {window}, expected {later}")
@@ -388,8 +388,8 @@ class Learning:
                 return controller.parameters
         except ArithmeticError as error:
             refusal = Refusal(
-                f"found numbers too large or too small ({error.args[-1]}), expected those "
-                "of a flight"
+                f"found numbers too large or too small ({error.args[-1]}), expected "
+                "numbers of a flight"
             )
         except ValueError as error:  # ParameterError, or LAPACK finds no eigenvalues of a matrix
             refusal = Refusal(str(error))
@@ -458,14 +458,14 @@ def _certificate(
         proposed.observer.states == start.observer.states,
         "controller.observer.states",
         ", ".join(proposed.observer.states),
-        f"those of the initial parameters: {', '.join(start.observer.states)}",
+        f"the states of the initial parameters: {', '.join(start.observer.states)}",
     )
     speeds = _speeds(start)
     require(
         _speeds(proposed) == speeds,
         "controller.schedule",
         _speeds(proposed) or "none",
-        f"that of the initial parameters: {speeds or 'none'}",
+        f"the speeds of the initial parameters: {speeds or 'none'}",
     )
     least = start.observer.margin
     if start.learn is not None:
