@@ -89,7 +89,7 @@ def test_outputs_are_read_from_real_messages(name: str, channels: str) -> None:
         row = channel_map.outputs[channel]
         message = fill(message_type(row.type)(), AIRSPEED[name] if channel == "V" else RATES[name])
         message = deserialize_message(serialize_message(message), type(message))
-        value = to_channel(read_raw(message, row.field, row.function), row.line)
+        value = to_channel(read_raw(message, row.field, row.function), row.conversion)
         assert value == approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)  # float32
 
 
@@ -101,7 +101,7 @@ def test_inputs_are_written_into_real_messages(name: str) -> None:
         message = message_type(channel_map.messages[row.message].type)()
         for field, value in channel_map.messages[row.message].values.items():
             set_field(message, field, value)
-        set_field(message, row.field, to_raw(row.trim + 0.1, row.line))
+        set_field(message, row.field, to_raw(row.trim + 0.1, row.conversion))
         message = deserialize_message(serialize_message(message), type(message))
         assert get_field(message, row.field) == approx(expected, abs=1e-3), path
 

@@ -142,7 +142,7 @@ def test_u_stays_inside_its_limits_around_trim() -> None:
         receive_u(bridge, 0.01, u)
         rows = CHANNEL_MAP.inputs.values()
         assert bridge.raw() == approx(
-            [to_raw(row.trim + getattr(row, limit), row.line) for row in rows]
+            [to_raw(row.trim + getattr(row, limit), row.conversion) for row in rows]
         )
 
 

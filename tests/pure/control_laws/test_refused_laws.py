@@ -65,7 +65,7 @@ def test_law_of_more_than_y_refused() -> None:
         COMMON | {"law": "indi"},
     )
     refused(
-        f"controller.law: found 'mackunis', which needs the derivative of y, {topics}",
+        f"controller.law: found 'mackunis', which needs a derivative of y, {topics}",
         COMMON | {"law": "mackunis"},
     )
 

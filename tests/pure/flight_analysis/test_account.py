@@ -95,7 +95,7 @@ def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 def test_whole_log_lacks_nothing(
     whole: Path, figures: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The counts are by hand: 200 Hz, 100 Hz and 50 Hz over two seconds, with both ends."""
+    """Count the samples by hand: 200 Hz, 100 Hz and 50 Hz over two seconds, with both ends."""
     assert (figures["outcome"]["sentence"], figures["notes"], figures["account"]["lacks"]) == (
         "completed",
         [],
@@ -500,7 +500,7 @@ def test_samples_before_the_flight_stand_for_none_of_the_flight(
 def test_rms_is_weighted_by_time() -> None:
     """A second with e = 1 is followed by a second with e = 3 that lacks nine tenths of its samples.
 
-    The rms by hand is sqrt((1 + 9) / 2).
+    By hand, the rms is sqrt((1 + 9) / 2).
     """
     t = np.concatenate([np.arange(0.0, 1.0, 0.001), np.arange(1.0, 2.0, 0.01)])
     e = np.where(t < 1.0, 1.0, 3.0)

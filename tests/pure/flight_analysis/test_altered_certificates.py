@@ -183,12 +183,12 @@ def without_entry(content: Content) -> None:
 
 
 def first(**members: Any) -> Alter:
-    """Return an alteration that adds a step before those of the first part."""
+    """Return an alteration that adds a step before the steps of the first part."""
     return lambda content: content["parts"][0]["steps"].insert(0, members)
 
 
 def last(**members: Any) -> Alter:
-    """Return an alteration that adds a step after those of the first part."""
+    """Return an alteration that adds a step after the steps of the first part."""
     return lambda content: content["parts"][0]["steps"].append(members)
 
 

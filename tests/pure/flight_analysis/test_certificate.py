@@ -247,7 +247,7 @@ gusts:
 
 @pytest.mark.usefixtures("coarse")
 def test_section_that_gains_wrote_has_margins_and_a_certificate(tmp_path: Path) -> None:
-    """The conditions are those of the selection, to the six digits that the section has."""
+    """The conditions agree with the selection, to the six digits that the section has."""
     frame, section = tmp_path / "one.yaml", tmp_path / "gains.yaml"
     path = tmp_path / "certificate.json"
     frame.write_text(ONE_CHANNEL)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Test figures of merit and plots of a guided flight.
 
-One log is computed by hand, and another is from a flight.
+One log is written by hand, and another comes from a flight.
 """
 
 import json

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Test the metrics of a flight against numbers by hand."""
+"""Test the metrics of a flight against numbers that are computed by hand."""
 
 import math
 from dataclasses import asdict

@@ -126,7 +126,7 @@ def recorded(
 
 
 def headings(page: str) -> list[str]:
-    """Return the headings of the blocks in their order, without those of the tiles."""
+    """Return the headings of the blocks in their order, without the headings of the tiles."""
     return re.findall(r'<h2 id="[^"]*">([^<]*)</h2>', page)
 
 

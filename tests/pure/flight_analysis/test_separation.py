@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Test how close the aircraft of a fleet came to each other, against distances by hand."""
+"""Test how close the aircraft of a fleet came to each other.
+
+The results are compared with distances that are computed by hand.
+"""
 
 import json
 from collections.abc import Callable, Sequence

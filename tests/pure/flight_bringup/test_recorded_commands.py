@@ -54,7 +54,8 @@ def test_flight_of_a_recorded_command_is_flown_again_from_its_log_alone(
 def test_file_in_place_of_the_values_of_another_refused(scenario_file: Path) -> None:
     scenario = rise_di.find_scenario(scenario_file)
     recorded = scenario.reference_model.recorded["q"].model_dump() | {"file": "other.csv"}
-    with refusing("recorded.q.file: found it beside source, time, value, expected a file alone"):
+    found = "found a file together with source, time, value"
+    with refusing(f"recorded.q.file: {found}, expected a file alone"):
         scenario.vary(reference_model={"recorded": {"q": recorded}})
 
 

@@ -98,9 +98,9 @@ def test_a_campaign_refuses_what_it_does_not_fly(
 
 
 def test_a_campaign_refuses_a_key_that_is_new(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only placed keys are flown.
+    """A key that is in none of the lists of flown keys is refused.
 
-    The quantisation stands for a key that was added today.
+    The quantisation stands for such a new key.
     """
     require_flyable(SERVO)
     new = SERVO.vary(aircraft={"sensors": {"quantisation": [0.01] * 4}})

@@ -231,7 +231,7 @@ class StoppedError(Exception):
 def test_log_of_px4_becomes_a_module_and_the_next_log_another_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The effects are those of the simulated aircraft, 15 % less than in the scenario.
+    """The log shows the effects of the simulated aircraft, 15 % less than in the scenario.
 
     So the errors fall with the new gains.
     """

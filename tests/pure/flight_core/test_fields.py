@@ -174,7 +174,7 @@ def test_unknown_rule_or_type_raises(annotation: Any) -> None:
     ],
 )
 def test_numbers_are_those_of_yaml_1_2(text: str, value: float) -> None:
-    """The expected values are by hand, from the core schema of YAML 1.2.2, section 10.3.2."""
+    """The expected values follow from the core schema of YAML 1.2.2, section 10.3.2."""
     read = parse_yaml(f"a: {text}", "file", "a mapping")["a"]
     assert (type(read), read) == (type(value), value)
 

@@ -864,7 +864,7 @@ def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains(
     assert 0.02 <= q == V < 0.029
     assert p == r == approx(0.03, abs=1e-3)
     assert aim.is_free == [True, False, False, True]
-    assert aim.beside is file
+    assert aim.first is file
     # once every part is learned no gain set has to stay
     assert goal(start, file, model, [("q", "V"), ("p", "r")], {}).is_free == [True] * 4
     design = selected_observer(
@@ -900,7 +900,10 @@ def test_price_of_a_margin_that_is_asked_for_is_told() -> None:
     proposed, price = asked._designed(OSPREY, known, {})
     assert proposed.observer is not None
     assert proposed.observer.margin == 0.04
-    sentence = r"^([\d.]+) times the error of 29 ms of delay margin, since 40 ms are asked for$"
+    sentence = (
+        r"^([\d.]+) times the error of a design with 29 ms of delay margin, "
+        r"because 40 ms are asked for$"
+    )
     assert price is not None
     times = re.search(sentence, price)
     assert times is not None, price

@@ -174,7 +174,7 @@ def test_edges_are_those_of_pulses_doublets_and_ramps() -> None:
         ({"chirps": {"q": CHIRP | {"stop": 1.0}}}, "later than start = 1 s"),
         (
             {"chirps": {"q": CHIRP | {"last_frequency": 2.0}}},
-            "last_frequency: found 2.0, expected another than first_frequency",
+            "last_frequency: found 2.0, expected a value other than first_frequency",
         ),
         ({"chirps": {"x": CHIRP}}, "chirps.x: found channel 'x', expected one of q, p, r"),
         ({"recorded": {"q": {}}}, "recorded.q.time: found 0 values, expected at least 2, or a"),

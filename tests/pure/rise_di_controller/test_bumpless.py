@@ -422,7 +422,7 @@ class Engagement:
             return
         u = np.array(
             [
-                to_channel(raw_i, row.line) - row.trim
+                to_channel(raw_i, row.conversion) - row.trim
                 for raw_i, row in zip(raw.tolist(), rows, strict=True)
             ]
         )

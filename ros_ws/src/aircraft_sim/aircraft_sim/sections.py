@@ -311,7 +311,7 @@ class ActuatorConfig(Config):
         self.read_faults()
 
     def read_faults(self) -> tuple[effector_faults.Fault, ...]:
-        """Return the faults that `faults` describes. Raises ParameterError."""
+        """Return the faults in `faults`. Raises ParameterError if one does not have its form."""
         return tuple(
             effector_faults.read_fault(sentence, f"faults[{number}]")
             for number, sentence in enumerate(self.faults)

@@ -124,7 +124,7 @@ class Bridge:
                 f"{name} is stamped {seconds(abs(now_ns - stamp_ns)):.3f} s {side} now{hint}",
             )
         last = self._readings.get(name)
-        value = to_channel(raw, row.line)
+        value = to_channel(raw, row.conversion)
         if last is not None:
             require_newer(stamp_ns, last.stamp_ns, name)
             if isinstance(row, OutputRow) and row.low_pass > 0.0:
@@ -358,14 +358,14 @@ class Bridge:
         return None
 
     def _reason_against_trim(self, name: str) -> Refusal | None:
-        """Say why the trim of an input that the autopilot sends is refused, or return None.
+        """Return a refusal of the trim that the autopilot sends for an input, or None.
 
-        The trim is refused if the trim plus a limit of u lies outside the range of the field.
+        It is refused if the trim plus a limit of u lies outside the range of the field.
         """
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
         (low, high), ends = row.range, (trim + row.lower, trim + row.upper)
-        if all(low - ROUNDING <= to_raw(end, row.line) <= high + ROUNDING for end in ends):
+        if all(low - ROUNDING <= to_raw(end, row.conversion) <= high + ROUNDING for end in ends):
             return None
         return Refusal(
             f"{name}: its trim is {trim:.3g} now, and the limits [{row.lower:g}, "
@@ -516,7 +516,7 @@ class Bridge:
         source = self._readings.get(trim_key(name))
         if name in self._trim and self._is_captured():
             return self._trim[name]
-        return row.trim if source is None else to_channel(source.value, row.line)
+        return row.trim if source is None else to_channel(source.value, row.conversion)
 
     def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
         """Return the names and the values of the pose's fresh channels.
@@ -547,7 +547,7 @@ class Bridge:
         )
 
     def _raw(self, name: str, u: float) -> float:
-        return to_raw(self.trim(name) + u, self.channel_map.inputs[name].line)
+        return to_raw(self.trim(name) + u, self.channel_map.inputs[name].conversion)
 
     def raw(self) -> FloatArray:
         """Return the raw values of the inputs that are sent in this phase, (m,)."""

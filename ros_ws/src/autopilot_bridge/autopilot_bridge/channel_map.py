@@ -41,14 +41,14 @@ class LinearConversion(NamedTuple):
     offset: float  # unit of the channel
 
 
-def to_channel(raw: float, line: LinearConversion) -> float:
+def to_channel(raw: float, conversion: LinearConversion) -> float:
     """Convert a raw value to a channel: sign scale raw + offset."""
-    return line.sign * line.scale * raw + line.offset
+    return conversion.sign * conversion.scale * raw + conversion.offset
 
 
-def to_raw(channel: float, line: LinearConversion) -> float:
+def to_raw(channel: float, conversion: LinearConversion) -> float:
     """Convert a channel to a raw value: sign (channel - offset) / scale."""
-    return line.sign * (channel - line.offset) / line.scale
+    return conversion.sign * (channel - conversion.offset) / conversion.scale
 
 
 def get_field(message: Any, path: str) -> Any:
@@ -193,17 +193,18 @@ def read_raw(message: Any, path: str, function: str, turned_by: str | None = Non
 
     If `turned_by` is given, it is the path of a quaternion that rotates a vector from the body to
     the world. The raw value is then the component of the rotated vector that `path` names. Raises
-    ChannelError, with the reason "field" if the field is missing, and "finite" if its value is not
-    finite.
+    ChannelError, with the reason "field" if the field is missing or cannot be converted, and
+    "finite" if its value is not finite.
     """
     value = get_field(message, path)
     try:
         raw = DERIVED[function](value) if turned_by is None else _turned(message, path, turned_by)
     except (AttributeError, TypeError, ValueError):
-        what = f"function {function}" if turned_by is None else turned_by
-        raise ChannelError(
-            SampleFault.FIELD, f"{what} cannot convert {path} of {type(message).__name__}"
-        ) from None
+        field = f"{path} of {type(message).__name__}"
+        cause = f"function {function} cannot convert {field}"
+        if turned_by is not None:
+            cause = f"{field} cannot be turned by {turned_by}"
+        raise ChannelError(SampleFault.FIELD, cause) from None
     if not math.isfinite(raw):
         raise ChannelError(SampleFault.FINITE, f"{path} = {raw} is not finite")
     return raw
@@ -212,7 +213,8 @@ def read_raw(message: Any, path: str, function: str, turned_by: str | None = Non
 def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
     """Return the class of "package/msg/Type" or "package/srv/Type".
 
-    Raises ParameterError, whose message names the package to install.
+    Raises ParameterError if the package is not installed or has no such type. The message of the
+    error names the package.
     """
     package, section, kind = name.split("/")
     try:
@@ -250,7 +252,8 @@ def version_fault(topic: str, message_class: Any) -> Refusal | None:
     if topic == expected:
         return None
     return Refusal(
-        f"{topic}: {definition}, whose topic is {expected}: change the map, or install the release"
+        f"{topic}: {definition}, whose topic is {expected}: change the map, or install "
+        "the message package of the autopilot's release"
     )
 
 

@@ -3,8 +3,8 @@
 """Check which rows of a channel map are right for a release of an autopilot.
 
 A row is right if the message definition has the field of the row, with the components that the
-row's function needs. For PX4, the topic must also have the version of the definition. If the source
-of a condition names a constant, the value of this constant must be one of the values of the
+row's function needs. For PX4, the topic must also have the version of the definition. If the text
+`source` of a condition names constants of the message, their values must be among `one_of` of the
 condition.
 """
 
@@ -34,7 +34,7 @@ has them."""
 PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # name in a package.xml (REP 149)
 CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b")
 # The line that ends the request in the definition of a service.
-REQUEST = re.compile(r"^---\s*$", re.MULTILINE)
+REQUEST_END = re.compile(r"^---\s*$", re.MULTILINE)
 VERSION = "MESSAGE_VERSION"  # the constant in definitions of PX4
 
 
@@ -54,10 +54,12 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
     """Return the definitions of the message types `kinds`, read from packages below a folder.
 
     The result also has all types that the `kinds` contain. Types that no package has are left out.
-    Raises ParameterError if there is no package.
+    Raises ParameterError if there is no folder, no package with a folder `msg` below it, or a
+    definition that cannot be read.
     """
     expected = (
-        "a folder with the sources of a message package: package.xml, msg/*.msg and srv/*.srv"
+        "a folder with the sources of a message package: package.xml, msg/*.msg, and srv/*.srv for "
+        "services"
     )
     require(folder.is_dir(), "--definitions", f"{folder}, which is no folder", expected)
     packages = {}
@@ -66,7 +68,7 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
             path.parent / "msg"
         ).is_dir():
             packages[match[1].decode()] = path.parent
-    require(bool(packages), "--definitions", f"{folder} without one", expected)
+    require(bool(packages), "--definitions", f"{folder} without a message package", expected)
     types: dict[str, tuple[Any, Any]] = {}
     waiting = list(kinds)
     while waiting:
@@ -135,7 +137,7 @@ def _parsed(text: str, kind: str) -> Types:
     """Return the types in the text of a definition. For a service, this is only the request."""
     try:
         if "/srv/" in kind:
-            (request,) = get_types_from_msg(REQUEST.split(text)[0], kind).values()
+            (request,) = get_types_from_msg(REQUEST_END.split(text)[0], kind).values()
             return {kind: request}
         return get_types_from_msg(text, kind)
     except (TypesysError, ValueError, LookupError) as error:
@@ -167,7 +169,7 @@ def _fault(types: Types, used: UsedField) -> Refusal | None:
             return Refusal(f"no {step}")
         node, content = fields[match[1]]
         if match[2] is not None and node is Nodetype.ARRAY and int(match[2]) >= content[1]:
-            return Refusal(f"{match[1]} of {content[1]}")
+            return Refusal(f"{match[1]} has only {content[1]} elements")
         element = _element((node, content))
         field = (node, content) if match[2] is None else element
         member_kind = element[1] if element[0] is Nodetype.NAME else ""
@@ -207,4 +209,4 @@ def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) 
         for constant in constants
         if values[constant] not in row.one_of
     ]
-    return Refusal(", ".join(wrong)) if wrong else None
+    return Refusal(f"{', '.join(wrong)}, which one_of lacks") if wrong else None

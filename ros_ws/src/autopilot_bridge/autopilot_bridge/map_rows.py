@@ -80,7 +80,7 @@ class Row(Config):
     source: str = Field(min_length=1, description="where the row comes from")
 
     @property
-    def line(self) -> LinearConversion:
+    def conversion(self) -> LinearConversion:
         """The conversion between the raw value and the channel."""
         return LinearConversion(self.sign, self.scale, self.offset)
 

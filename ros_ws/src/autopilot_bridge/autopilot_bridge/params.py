@@ -182,7 +182,7 @@ class ChannelMap(Config):
                 low < high, f"{key}.range", list(row.range), "the lower end before the upper one"
             )
             for limit, u in (("trim", 0.0), ("lower", row.lower), ("upper", row.upper)):
-                raw = to_raw(row.trim + u, row.line)
+                raw = to_raw(row.trim + u, row.conversion)
                 require(
                     low - ROUNDING <= raw <= high + ROUNDING,
                     f"{key}.{limit}",
@@ -393,13 +393,16 @@ def maps() -> list[str]:
 def find_map(name: str) -> Path:
     """Return the file of a channel map, by its name in the library or by a path ending in .yaml.
 
-    Raises ParameterError.
+    Raises ParameterError if there is no such file.
     """
     return find_file(name, LIBRARY, "map", "a channel map").absolute()
 
 
 def load_map(name: str) -> ChannelMap:
-    """Load a channel map, given its name in the library or its path. Raises ParameterError."""
+    """Load a channel map, given its name in the library or its path.
+
+    Raises ParameterError if there is no such file, or if it is no valid channel map.
+    """
     path = find_map(name)
     content = read_yaml(path, f"map {path}", "a channel map")
     require(isinstance(content, dict), f"map {path}", type(content).__name__, "a mapping")

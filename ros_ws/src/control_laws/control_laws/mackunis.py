@@ -21,7 +21,7 @@ from rise_di_controller.params import ControllerConfig
 
 
 class MacKunisParams(NamedTuple):
-    """Gains of the law over m channels, each with the shape (m,)."""
+    """Gains of the law over m channels, each with the shape (m,), or (m, N) for N sets of gains."""
 
     K: Array  # 1/s
     Lambda: Array  # 1/s
@@ -52,8 +52,9 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     is the e of the previous tick. If u_trim is constant and abs(r) > eps, then u_dot = -Omega^-1 (K
     r + beta sgn(r)). With `ideal`, e_dot = y_dot - y_m_dot with the perfect derivative of C x.
     Otherwise e_dot is a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt -
-    e_dot). Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010. Here
-    the law inverts the nominal Omega.
+    e_dot). Steps of Pi and of integral_e that would increase a saturation of u are dropped. Source:
+    W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010. The matrix that the
+    law inverts is the nominal Omega.
     """
     Omega = model.Omega
     inverse = model.inverse
@@ -95,17 +96,17 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
 
 
 class MacKunisConfig(ControllerConfig):
-    """The acceleration-based RISE inversion, flown by campaigns only."""
+    """The acceleration-based RISE inversion, which only comparisons of laws use."""
 
-    needs = "the derivative of y"
+    needs = "a derivative of y"
 
 
 def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:
     """Return the parameters for the gains of a search.
 
-    The gains are K, Lambda and beta (m, N), softening (1, N) and, without a perfect y_dot, filter
-    (1, N), rad/s. eps is softening times beta / K. Inside eps, the softened sign is linear, and its
-    gain K / softening adds to K.
+    N candidates have K, Lambda and beta (m, N), softening (1, N) and, without a perfect y_dot, the
+    bandwidth `filter` (1, N), rad/s. eps is softening times beta / K. Inside eps, the softened sign
+    is linear, and its gain K / softening adds to K.
     """
     K = gains["K"]
     beta = gains["beta"]

@@ -24,10 +24,11 @@ SETTLE_TIME = 1.0
 
 
 def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping[str, str]]:
-    """Write the middleware profile of this host to a file. Raises ParameterError.
+    """Write the middleware profile of this host to a file.
 
-    Returns the address of this host, the addresses of all hosts, and the environment that selects
-    the profile.
+    Raises ParameterError if the addresses are not usable, if none of them belongs to this host, or
+    if the file cannot be written. Returns the address of this host, the addresses of all hosts, and
+    the environment that selects the profile.
     """
     hosts = addresses(peers)
     local = {entry.address for entry in chain.from_iterable(psutil.net_if_addrs().values())}

@@ -198,7 +198,10 @@ def read_fleet(
 def _scenario(
     config: FleetConfig, aircraft: AircraftOfFleet, folder: Path, duration: float | None
 ) -> Scenario:
-    """Return the scenario of an aircraft. Raises ParameterError."""
+    """Return the scenario of an aircraft.
+
+    Raises ParameterError if a scenario or a route is missing or invalid.
+    """
     name = aircraft.scenario or config.scenario
     scenario = find_scenario(
         folder / name if name.endswith(".yaml") else name, with_route=aircraft.route is None

@@ -54,7 +54,7 @@ NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 def absolute_namespace(namespace: str) -> str:
     """Return the namespace of an aircraft in the form "/uav1". The root namespace is "".
 
-    Raises ParameterError if ROS 2 does not permit the name.
+    Raises ParameterError if a word does not match NAME.
     """
     words = [word for word in namespace.split("/") if word]
     for word in words:
@@ -62,7 +62,7 @@ def absolute_namespace(namespace: str) -> str:
             bool(NAME.fullmatch(word)),
             "--namespace",
             repr(namespace),
-            "letters, digits and single _, as uav1, a letter first",
+            "words such as uav1: a letter, then letters and digits, with single _ between them",
         )
     return "".join(f"/{word}" for word in words)
 
@@ -81,7 +81,10 @@ class Autopilot(NamedTuple):
 
 
 def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
-    """Find an autopilot by the name or the path of its channel map. Raises ParameterError."""
+    """Find an autopilot by the name or the path of its channel map.
+
+    Raises ParameterError if there is no such map, or if it is invalid.
+    """
     return Autopilot(load_map(map_name), find_map(map_name), dry_run)
 
 
@@ -89,10 +92,10 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     """Check that the bridge can send all that the controller may command.
 
     If the bridge could not, it would clip u, and the anti-windup of the law would not know of it.
-    The limits of the scenario are not narrowed, because the log must have the parameters in use. A
-    dry run sends nothing, so it passes the check. The check fails for a controller that holds u
-    while it is inactive, because the bridge engages only if u is near trim. Raises ParameterError
-    if the check fails.
+    The limits of the scenario are not narrowed to those of the map, because the scenario in the log
+    would then differ from the parameters in use. A dry run sends nothing, so it passes the check.
+    The check fails for a controller that holds u while it is inactive, because the bridge engages
+    only if u is near trim. Raises ParameterError if the check fails.
     """
     if autopilot.dry_run:
         return
@@ -114,8 +117,8 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
             # A different check refuses channels that differ, and names them.
             continue
         of_map = (
-            f"of {name} in the map {channel_map.name}: what the bridge clips, the law's "
-            "anti-windup does not know"
+            f"of {name} in the map {channel_map.name}: the law's anti-windup does not know what "
+            "the bridge clips"
         )
         require(
             low >= row.lower,
@@ -160,7 +163,8 @@ def _optional(scenario: Scenario) -> tuple[NodeSpec, ...]:
 
 
 ON_START = -1.0  # `start_time` of nodes that wait for t = 0 on the topic `start`
-LEAD = 0.5  # s from the message of t = 0 on `start` to t = 0, within which a busy host delivers it
+# s, how long before t = 0 its instant is published on `start`, so that even a busy host delivers it
+LEAD = 0.5
 
 
 def start_lead(startup: float) -> float:
@@ -207,9 +211,10 @@ def parameter_overrides(
     If several nodes share a process, the keys are "node:name". Each parameter goes to the nodes
     that need it:
 
-    - In real time the nodes that begin at t = 0 get the instant of t = 0, or ON_START.
-    - In lockstep the aircraft gets the rate of u and the duration, controller and guidance get the
-      rate of y, and the reference model gets the rate of u_m.
+    - In real time the nodes that begin at t = 0 get `start_time`, the instant of t = 0 or ON_START.
+    - Every node but the bridge gets `lockstep`. In lockstep the aircraft gets the rate of u and the
+      duration, controller and guidance get the rate of y, and the reference model gets the rate of
+      u_m.
     - Guidance gets the parameters of `guidance_by_rule`. The learner gets the scenario.
     - The recorder gets the files to attach to the log. This function writes them into the folder of
       the run.

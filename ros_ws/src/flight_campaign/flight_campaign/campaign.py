@@ -322,7 +322,7 @@ class MonteCarlo:
         )
 
     def write_rows(self, path: Path) -> None:
-        """Write the table as one Parquet file, chunk by chunk. Raises OSError."""
+        """Write the table as one Parquet file, chunk by chunk. Raises OSError if that fails."""
         with replacing(path) as stream:
             self.rows().sink_parquet(stream)
 

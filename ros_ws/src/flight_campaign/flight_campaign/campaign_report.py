@@ -98,7 +98,8 @@ LEARNER_LEGEND = (
 def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
     """Write the summary, the report and the scenarios of the worst aircraft.
 
-    Returns the summary and the table of the overview. Raises ParameterError.
+    Returns the summary and the table of the overview. Raises ParameterError if a file cannot be
+    written.
     """
     definition = campaign.definition
     tallies = [campaign.tally(case) for case in range(definition.cases)]
@@ -395,7 +396,7 @@ def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str
 
 
 def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
-    """Return the name of a metric with its unit, and the factor from SI."""
+    """Return the name of a metric with its unit, and the factor that converts SI to this unit."""
     kind, _, channel = name.partition(".")
     if not channel:
         return OF_LEARNER.get(name, name), 1.0

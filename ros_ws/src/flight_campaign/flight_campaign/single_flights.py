@@ -32,7 +32,7 @@ from rise_di_controller.learning.proposals import UNVERIFIED, Event, EventKind
 
 MakeLearner = Callable[[Scenario], Learn | None]
 """Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner` does.
-Raises ParameterError."""
+Raises ParameterError if the scenario cannot learn."""
 
 CHUNK = 4
 """Aircraft in a chunk. With so few, the progress moves every minute and no core idles at the end.
@@ -102,7 +102,7 @@ class SingleFlight(NamedTuple):
 def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> SingleFlight:
     """Fly a scenario; its errors are the true errors at the ticks of the controller.
 
-    Raises ParameterError.
+    Raises ParameterError if the scenario cannot be flown in one process.
     """
     events: list[Event] = []
     learn = None if learner is None else learner(scenario)

@@ -78,11 +78,13 @@ def _accept_option() -> Any:
 class Jsbsim:
     """Linearise an aircraft of JSBSim, select its gains, fly it, and write a scenario of it.
 
-    Exit status: 0; 2 for bad input; 3 if the aircraft does not trim or does not fly.
+    Exit status: 0; 2 for bad input, or if the gains fall short of the margins, in which case the
+    scenario is written all the same; 3 if the aircraft does not trim or does not fly.
     """
 
     aircraft: str = argument(
-        "Name of an aircraft of JSBSim, or the path of your own with a /: its XML file or folder.",
+        "Name of an aircraft of JSBSim, or the path of your own, with a / in it, as in ./NAME: its "
+        "XML file or folder.",
         default=REQUIRED,
     )
     speed: float = option("True airspeed at which to trim and fly, m/s.", default=REQUIRED)
@@ -95,7 +97,11 @@ class Jsbsim:
     observer: bool = option(
         "Add an extended-state observer from Omega and the lags.", default=False
     )
-    guidance: bool = option("Fly and write guidance by rule in place of the pulses.", default=False)
+    guidance: bool = option(
+        "Fly with guidance, whose parameters follow from the other sections, in place of the "
+        "pulses, and write it into the scenario.",
+        default=False,
+    )
     learn: bool = option("Write a scenario that learns A and B in flight.", default=False)
     margin: float | None = rare_option(
         "With --observer or --learn: least delay margin that the loop with an observer must have, "
@@ -111,7 +117,7 @@ class Jsbsim:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Identify the aircraft, write its scenario, and print both."""
+        """Identify the aircraft, write its scenario, and print the result and the path."""
         observes = self.observer or self.learn
         expected = "--observer or --learn beside it"
         require(self.margin is None or observes, "margin", self.margin, expected)
@@ -131,7 +137,7 @@ class Jsbsim:
         if not self.accept and not identified_aircraft.failure:
             # This takes as long as everything before it. If it came after the tables, users would
             # think that the command has ended.
-            with console.status("what would meet the margins"):
+            with console.status("searching for what would meet the margins"):
                 lack = reason_against_gains(identified_aircraft.selection)
         write_text("write", path, identified_aircraft.text)
         if self.as_json:
@@ -144,15 +150,15 @@ class Jsbsim:
             warn(f"error: {title} does not fly: {identified_aircraft.failure}")
             raise typer.Exit(CANNOT_FLY)
         if lack is not None:
-            where = f"{display_path(path)}, which says so in its first line; --accept takes it"
+            where = f"{display_path(path)}, whose first line says this; --accept accepts them"
             raise ParameterError(f"identify: {lack}; the gains are in {where}")
 
     def _scenario_path(self, name: str) -> Path:
         """Return where to write the scenario. It may only exist already if --write names it."""
         path = self.write or Path(f"jsbsim_{Path(name).stem}.yaml")
-        expected = "a file to write over, or another"
+        expected = f"--write {path} to replace it, or another file"
         is_new = self.write is not None or not path.exists()
-        require(is_new, "write", f"none, and {path} exists", expected)
+        require(is_new, "--write", f"no file, and {path} exists", expected)
         require_yaml("write", path)
         return path
 
@@ -206,7 +212,7 @@ class Log:
         "Delay of u, s; by default as in the scenario. A flight in one process has none."
     )
     refly: bool = option(
-        "Fly the scenario in this process with a feedforward and an observer of the model.",
+        "Fly the scenario in this process with a feedforward and an observer for the model.",
         default=False,
     )
     margin: float | None = rare_option(
@@ -272,7 +278,7 @@ class Log:
 
 @dataclass(frozen=True, kw_only=True)
 class Bridge:
-    """Excite each input of the aircraft behind a channel map by itself, open loop.
+    """Excite the inputs of the aircraft behind a channel map one at a time, open loop.
 
     From the response it selects gains, and writes a scenario that flies the aircraft. With --run it
     reads the log of such a flight, or one of `rise-di import`, and flies nothing.
@@ -326,7 +332,7 @@ class Bridge:
 
 
 def _jsbsim_name(aircraft: str) -> str:
-    """Return the name or the path of an aircraft of JSBSim. Raises ParameterError."""
+    """Return the name or the path of an aircraft of JSBSim. Raises ParameterError without one."""
     try:
         return require_aircraft(aircraft)
     except ParameterError as error:

@@ -3,9 +3,10 @@
 """Check the values of a parameter set by their annotations, and refuse them in sentences.
 
 Types are strict. Only these values are converted: an int to a float, a sequence to a tuple, an
-array of NumPy to lists, a scalar of NumPy to a number, and a path to a str. The annotations are
-float, int, bool, str, object, Literal, tuple, dict, unions of these, and parameter sets. Rules such
-as a limit come from `Field(...)` in Annotated.
+array of NumPy to lists, a scalar of NumPy to a number, a path to a str, a mapping to a parameter
+set, and a key of digits to an int. The annotations are float, int, bool, str, object, Literal,
+tuple, dict, unions of these, and parameter sets. Rules such as a limit come from `Field(...)` in
+Annotated.
 """
 
 import math
@@ -94,7 +95,8 @@ class Kind(NamedTuple):
     def read(self, value: object, key: str, problems: Problems) -> Any:
         """Return a value as the parameter set holds it.
 
-        If the value is not permitted, add a sentence to `problems` and return None.
+        Each value that is not permitted adds a sentence to `problems` and becomes None, also within
+        a tuple or a dict.
         """
         if hasattr(value, "dtype") and hasattr(value, "tolist"):  # an array or a scalar of NumPy
             value = value.tolist()
@@ -119,7 +121,7 @@ LIMITS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = MappingProxyType(
 
 
 def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) -> Kind:
-    """Permit an int or a float. A float can be infinite or NaN only with `allow_inf_nan`."""
+    """Permit an int and, if `kind` is float, a float, which is finite unless `allow_inf_nan`."""
     if unknown := limits.keys() - LIMITS.keys():
         raise TypeError(f"a number has no rule {', '.join(sorted(unknown))}")
     checks = [(*LIMITS[rule], limits[rule]) for rule in LIMITS if rule in limits]
@@ -218,7 +220,7 @@ def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = 
 
 
 def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
-    """Permit a dict with keys and values of two kinds."""
+    """Permit a dict with keys of one kind and values of another."""
     keys, values = map(kind_of, parts)
 
     def content(value: Mapping[Any, Any], key: str, problems: Problems) -> dict[Any, Any]:
@@ -235,7 +237,9 @@ def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = m
                     item, f"{key}.{name}", problems
                 )
             else:
-                problems.others.append(f"{key}: found the key {short_repr(name)}, expected a name")
+                problems.others.append(
+                    f"{key}: found the key {short_repr(name)}, expected {keys.expected}"
+                )
         return table
 
     return Kind("a dictionary", lambda value: isinstance(value, Mapping), content)
@@ -344,7 +348,7 @@ def Field(default: Any = REQUIRED, *, description: str = "", **rules: Any) -> An
             min_length and max_length of a tuple and of a dict.
 
     Returns:
-        The declaration, for the body of a subclass of `ControllerConfig`.
+        The declaration, for the body of a parameter set such as a subclass of `ControllerConfig`.
 
     Examples:
         >>> rise_di.Field(2.0, description="Gain, 1/s.", gt=0).default

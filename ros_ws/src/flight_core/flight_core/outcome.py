@@ -75,8 +75,8 @@ class Shortfall:
     """A shortfall of a flight, as a sentence and as numbers in SI.
 
     `brief` replaces the sentence in a headline if the sentence is too long. `times` is the factor
-    by which a value exceeds the allowed value. By this factor the worst shortfall of an aim is
-    found.
+    by which a value exceeds the allowed value. Of several shortfalls of an aim, the one with the
+    largest factor is the worst.
     """
 
     aim: Aim

@@ -166,7 +166,7 @@ class Config:
         return nest(flat | dict(changes))
 
     def _check(self) -> None:
-        """Check relations between the values. Raises ParameterError."""
+        """Check relations between the values. Raises ParameterError if they do not hold."""
 
     def model_copy(self, *, update: Mapping[str, Any]) -> Self:
         """Copy the set with new values, without a check of the values."""

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ask Linux's scheduler for settings with which fewer ticks of a node are late.
 
-No request needs a privilege. If Linux refuses a request, ticks are as late as without it.
+No request needs a privilege. If Linux refuses a request, nothing changes.
 """
 
 import ctypes
@@ -35,9 +35,10 @@ def compute_in_one_thread() -> None:
 
 
 def lower_real_time_priority(levels: int) -> None:
-    """Lower the real-time priority (chrt) of every thread of this process, if it has one.
+    """Lower the priority of every thread of a process with a real-time priority (chrt).
 
-    The priority falls by `levels`, but not below 1. Threads that are started later inherit it.
+    If the calling thread has such a priority, every thread of this process gets this priority less
+    `levels`, but at least 1. Threads that are started later inherit it.
     Processes of equal priority do not preempt each other. Compression in the recorder would
     therefore delay a tick of the law by milliseconds, and a tick of the law would delay y_m by up
     to 3 ms. Rate-monotonic priorities, lower for longer periods, are the optimal fixed priorities.
@@ -51,10 +52,11 @@ def lower_real_time_priority(levels: int) -> None:
 
 
 def leave_real_time_priority() -> None:
-    """Give every thread of this process that has a real-time priority (chrt) the default policy.
+    """Give every thread of a process with a real-time priority (chrt) the default policy.
 
-    A command that starts and watches nodes of real-time priority calls this, so that its wake-ups
-    and garbage collections do not delay ticks.
+    Nothing changes if the calling thread has no such priority. A command that starts and watches
+    nodes of real-time priority calls this, so that its wake-ups and garbage collections do not
+    delay ticks.
     """
     if os.sched_getscheduler(0) in REAL_TIME:
         _schedule_threads(os.SCHED_OTHER, 0)

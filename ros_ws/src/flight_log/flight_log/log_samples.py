@@ -131,6 +131,9 @@ def is_near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> MessageTable:
-    """Return a table in the order of its stamps; of equal stamps only the first sample stays."""
+    """Return a table in the order of its stamps.
+
+    If several samples have the same stamp, the table has only the first of them.
+    """
     stamps, places = np.unique(stamp_ns, return_index=True)
     return MessageTable(stamps, {name: values[places] for name, values in fields.items()})

@@ -95,7 +95,11 @@ def low_pass_delay(cutoff: float) -> float:
 
 
 def _read(path: Path) -> dict[str, float]:
-    """Read the parameters of DEFAULTS that are in a file. Raises ParameterError."""
+    """Read the parameters of DEFAULTS that are in a file.
+
+    Raises ParameterError if there is no such file, if it has no parameters, none of DEFAULTS, or
+    one of DEFAULTS that is negative or infinite.
+    """
     require(path.is_file(), "px4", f"no file {path}", EXPECTED)
     if file_kind(path) is FileKind.ULOG:
         parameters = read_foreign_log(path).parameters

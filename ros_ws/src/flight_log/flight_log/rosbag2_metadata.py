@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Read and make metadata.yaml of a bag, in version 9 of its format, and find a bag's files.
+"""Read the metadata.yaml of a bag, make one in version 9 of its format, and find a bag's files.
 
 The module needs no ROS.
 """
@@ -54,7 +54,7 @@ EXPECTED = "the metadata.yaml that rosbag2 writes"
 
 
 def plain_name(name: str) -> str:
-    """Return the name of a file of a bag without the suffix of a packed file."""
+    """Return the name of a bag's file, less the suffix that compression has added."""
     suffix = next((suffix for suffix in PACKED_SUFFIXES if name.endswith(suffix)), "")
     return name.removesuffix(suffix)
 
@@ -100,9 +100,10 @@ def _files_found(files: Sequence[Path]) -> str:
 
 
 def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
-    """Read metadata.yaml, and the log time of the last message in ns.
+    """Return the content of metadata.yaml below INFORMATION, and the end of the bag, ns.
 
-    Raises ParameterError if the file is missing, or if it was not made by rosbag2.
+    The end is the starting time plus the duration. Raises ParameterError if the file is missing, or
+    if it lacks one of these two times.
     """
     tree = read_yaml(run / METADATA, METADATA, EXPECTED)
     try:
@@ -125,9 +126,10 @@ def bag_metadata_yaml(
 ) -> str:
     """Return the text of a metadata.yaml.
 
-    Compression, custom data and distribution come from `previous`, which `read_bag_metadata`
-    returned for an earlier metadata.yaml. Files that it lists but that are `missing` from the
-    folder stay in the lists of files.
+    The compression, the custom data and the ROS distribution come from `previous`, the content that
+    `read_bag_metadata` returned for an earlier metadata.yaml. Without it they are none, none and
+    jazzy. The files that are `missing` from the folder stay in `relative_file_paths`, and in
+    `files` if `previous` describes them.
     """
     counts: dict[str, TopicCount] = {}
     for count in chain.from_iterable(file.counts for file in files):
@@ -167,12 +169,12 @@ def bag_metadata_yaml(
 
 
 def _order(name: str) -> tuple[int, str]:
-    """Return the key that sorts the files of a bag by number, so that _2 is before _10."""
+    """Return a sort key for the files of a bag: a shorter name comes first, so _2 before _10."""
     return len(plain_name(name)), name
 
 
 def _entries(information: Mapping[str, Any], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the entries of files in the content of metadata.yaml."""
+    """Return the entries in `files` of metadata.yaml whose path is among `names`."""
     entries = information.get("files")
     entries_of_files = entries if isinstance(entries, list) else []
     return [

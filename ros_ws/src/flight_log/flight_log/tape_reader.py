@@ -363,10 +363,11 @@ def aircraft_namespaces(topics: Collection[str]) -> list[str]:
 
 
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
-    """Return the namespace of an aircraft, or "" for the root and if there is no aircraft.
+    """Return the namespace of an aircraft. The result is "" for the root namespace.
 
-    `namespace` is the choice of the caller, or None. Raises ParameterError if no aircraft is in the
-    chosen namespace, or if there are several aircraft and no choice.
+    It is also "" if the log has no aircraft. `namespace` is the choice of the caller, or None.
+    Raises ParameterError if no aircraft is in the chosen namespace, or if there are several
+    aircraft and no choice.
     """
     aircraft = aircraft_namespaces(topics)
     aircraft_names = ", ".join(name or "/" for name in aircraft) or "none"

@@ -5,8 +5,8 @@
 The names of the message are the channels, the positions are the values, and the stamp is the
 instant of the sample. The channels are constant during a flight. So the bytes of a message are laid
 out once, and each sample changes only the stamp and the values. This is several times faster than
-the serialisation by the middleware. The other bytes also stay the same, while the middleware leaves
-uninitialised memory between two strings.
+the serialisation by the middleware. The padding is always 0, so equal samples have equal bytes. The
+middleware leaves uninitialised memory in the padding between two strings.
 """
 
 import math
@@ -54,7 +54,7 @@ def to_message(
 
 
 def from_message(message: JointState, channels: Sequence[str]) -> StampedVector:
-    """Return some channels of a message, in the order of `channels`.
+    """Return the stamp, the values of `channels` in this order, and the sender of a message.
 
     Raises ChannelError for invalid names, lengths or values.
     """
@@ -68,8 +68,8 @@ class Encoder:
 
     Without names, the message has no channels. In lockstep such a message says that there is no
     sample at this instant. The layout is CDR (OMG Common Object Request Broker Architecture, 9.3).
-    The offset of each value from the encapsulation is a multiple of the size of the value. Padding
-    bytes are 0.
+    Each count and each value is aligned to its own size, counted from the end of the encapsulation.
+    Padding bytes are 0.
     """
 
     def __init__(self, names: Sequence[str], frame_id: str) -> None:
@@ -148,7 +148,8 @@ class Decoder:
             encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position))
             != raw
         ):
-            # the message has more than a named vector, so the middleware decodes it each time
+            # An Encoder makes other bytes, for example without velocities or with padding of 0. So
+            # the middleware decodes each message of this publisher.
             return
         self._names = list(message.name)
         self._place = encoder.place
@@ -197,7 +198,10 @@ def sender_of(raw: bytes) -> str | None:
 
 
 def stamp_of(raw: bytes) -> int:
-    """Read the stamp at the beginning of a message, ns. Raises ChannelError, reason "malformed"."""
+    """Read the stamp at the beginning of a message, ns.
+
+    Raises ChannelError with the reason "malformed" if the bytes are too short or no plain CDR.
+    """
     order = BYTE_ORDERS.get(raw[:2])
     if order is None or len(raw) < LENGTH_PLACE:
         raise ChannelError(

@@ -22,7 +22,10 @@ PORTS_A_DOMAIN = 250  # section 9.6.1.1
 
 
 def addresses(text: str) -> tuple[str, ...]:
-    """Return the addresses in a text like "10.0.0.1,10.0.0.2". Raises ParameterError."""
+    """Return the addresses in a text like "10.0.0.1,10.0.0.2".
+
+    Raises ParameterError if the text does not have two or more different IPv4 addresses of hosts.
+    """
     hosts = tuple(part.strip() for part in text.split(","))
     for address in hosts:
         try:

@@ -48,16 +48,17 @@ def prepare() -> None:
 
 
 def open_to_network() -> list[str]:
-    """Return UDP sockets of this process that are open on all interfaces.
+    """Return the UDP sockets of this process that are open on all interfaces.
 
-    With the loopback profile there should be none.
+    With the loopback profile there should be none. The sockets of any other profile are not
+    examined, because a user has chosen it, and the result is empty.
     """
     if os.environ.get(PROFILE_VARIABLE) != str(LOOPBACK_PROFILE):
         return []
     import psutil  # noqa: PLC0415 - see flight_ros.startup
 
     process = psutil.Process()
-    # before psutil 6: Ubuntu 24.04 has 5.9
+    # psutil before 6, such as 5.9 of Ubuntu 24.04, calls this method `connections`
     connections = getattr(process, "net_connections", None) or process.connections
     sockets = connections(kind="udp")
     return [

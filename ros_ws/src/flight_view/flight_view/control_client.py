@@ -21,8 +21,9 @@ STRINGS = Parameter.Type.STRING_ARRAY
 class ControlClient(Client):
     """Changes a running flight for `rise-di watch --control`.
 
-    All methods are called by one thread and may wait, except `cancel`. They return why something is
-    refused, or None. They raise ParameterError if a node or its answer is missing.
+    One thread calls the methods, and each call may wait. Only `cancel` returns at once, and another
+    thread calls it. A method returns the reason if a node refuses the change, else None. It
+    raises ParameterError if a node or its answer is missing.
     """
 
     NODES = ("aircraft", "bridge", "controller", "guidance")

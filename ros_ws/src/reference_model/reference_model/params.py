@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validate the parameters of the reference model, and convert them to arrays.
 
-The arrays belong to the model and to the profile of commands.
+There are arrays of the model, of the profile of commands, and of live commands.
 """
 
 import math
@@ -118,7 +118,7 @@ class Chirp(Config):
     def _check(self) -> None:
         require(self.stop > self.start, "stop", self.stop, f"later than start = {self.start:g} s")
         sweeps = self.last_frequency != self.first_frequency
-        require(sweeps, "last_frequency", self.last_frequency, "another than first_frequency")
+        require(sweeps, "last_frequency", self.last_frequency, "a value other than first_frequency")
 
 
 class Recorded(Config):
@@ -143,7 +143,7 @@ class Recorded(Config):
         if isinstance(file := values.get("file"), str) and file:
             try:
                 others = ", ".join(name for name in values if name != "file" and values[name])
-                require(not others, f"{key}.file", f"it beside {others}", "a file alone")
+                require(not others, f"{key}.file", f"a file together with {others}", "a file alone")
                 values = read_stick(file, f"{key}.file") | {"source": file}
             except ParameterError as error:
                 problems.others.append(str(error))
@@ -222,7 +222,7 @@ class SecondOrder(Config):
 
 
 class Linear(Config):
-    """The model as the matrices of equation (2), row by row."""
+    """The model x_m_dot = A_m x_m + B_m u_m, equation (2), as matrices row by row."""
 
     states: Names = Field(description="names of the states x_m, with the outputs among them")
     A_m: Numbers = Field(description="A_m row by row, 1/s")
@@ -300,7 +300,7 @@ class ReferenceModelConfig(NodeConfig):
 
     def _check_model(self) -> None:
         has_one = (self.second_order is None) != (self.linear is None)
-        models = "no model" if self.linear is None else "it beside linear"
+        models = "no model" if self.linear is None else "a section together with linear"
         require(has_one, "second_order", models, "exactly one model: second_order or linear")
         key = "second_order.damping"
         if self.second_order is not None:
@@ -365,11 +365,11 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def live_params(self) -> LiveParams:
-        """Return the limits of u_m and the gains of the ending, which follows the last u_m.
+        """Return the limits of u_m, and the gains that level the aircraft after the last u_m.
 
-        The gains are a quarter of the reference model's natural frequencies of p and q. If the
-        reference model has a damping of 0.9, the loop of the angle then has a damping of about
-        0.74.
+        The gains are a quarter of the reference model's natural frequencies of p and q, or 0 if
+        nothing is levelled. If the reference model has a damping of 0.9, the loop of the angle then
+        has a damping of about 0.74.
         """
         section = self.live
         channels = None

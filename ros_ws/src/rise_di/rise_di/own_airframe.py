@@ -81,8 +81,8 @@ def new_airframe(
 
     Args:
         source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
-            airframe file (.yaml), or of a text of AVL (system matrix, or stability derivatives) or
-            XFLR5 (state matrices).
+            airframe file (.yaml), or of a text file that AVL has written (system matrix, or
+            stability derivatives) or XFLR5 (state matrices).
         folder: Folder of both files.
         name: Name of the airframe. If empty, it is the name of the file.
         speed: Trim speed, as a number in m/s or with a unit, such as "176 ft/s".
@@ -93,8 +93,8 @@ def new_airframe(
         outputs: Outputs, at most as many as inputs. Each is the name of a state, or of a row of C
             with its unit ("V: ft/s"), or a sum of states ("V = 0.987 u + 0.163 w"). If empty, they
             are q, V, p and r, paired with elevator, thrust, aileron and rudder.
-        thrust: Whether to add an input thrust in units of the weight along the flight path, for a
-            model without a thrust.
+        thrust: Whether to add an input, a thrust along the flight path, in units of the weight.
+            This is for a model without a thrust.
         text: Text on the source of the numbers.
         lag: Lags of the actuators in s, one for all inputs or one for each. If None, it is 0.05 s
             for a control surface and 0.3 s for an engine.
@@ -170,7 +170,7 @@ def new_airframe(
 
 
 def _require_free(files: Sequence[Path], *, replace: bool) -> None:
-    """Check that no file exists already, unless it may be replaced. Raises ParameterError."""
+    """Raise ParameterError if a file exists already, unless it may be replaced."""
     for path in files:
         require(
             replace or not path.exists(),

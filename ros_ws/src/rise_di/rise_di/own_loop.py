@@ -299,9 +299,9 @@ def as_control(
     """Return the engaged law as a discrete system of python-control.
 
     The inputs are `y_NAME` and `y_m_NAME`, and the outputs `u_NAME`. The system has limits and
-    anti-windup. Its state has the state of the law, then u and y_m of the last tick. All states are
-    0 right after an engagement in trim. With an allocation the outputs are the effectors, and the
-    effectors are also the last values of the state.
+    anti-windup. Its state vector begins with the state of the law, followed by u and y_m of the
+    last tick. All states are 0 right after an engagement in trim. With an allocation the outputs
+    are the effectors, and the effectors are also the last values of the state.
 
     If `linear`, the result is the law near e = 0 without limits, for Bode plots and margins. It is
     a StateSpace from `y_NAME` to `u_NAME`. With an allocation it has the effectors T u as outputs,
@@ -316,7 +316,8 @@ def as_control(
 
     Raises:
         ParameterError: python-control is missing, the controller has a feedforward, which is no
-            part of the law, or `linear` is given for the literal sign.
+            part of the law, or `linear` is True and the controller has `sign: literal`, which is
+            not linear.
 
     Examples:
         >>> law = rise_di.as_control(rise_di.find_scenario("osprey_servo").controller, linear=True)

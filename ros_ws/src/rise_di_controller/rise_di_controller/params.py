@@ -275,7 +275,7 @@ class ControllerConfig(ControllerSection):
     def check_law(self) -> None:
         """Check the parameters of the law against each other and against the channels.
 
-        Raises ParameterError.
+        Raises ParameterError if they do not fit.
         """
 
 

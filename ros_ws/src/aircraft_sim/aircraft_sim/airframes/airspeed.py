@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute an airframe at other airspeeds than the trim speed.
 
-Its A, B and trim hold in level flight at the same altitude. The entries of A and B follow
-powers of the airspeed, and the trim is integrated over the airspeed.
+The A, B and trim of the result hold in level flight at the altitude of the given airframe. The
+entries of A and B follow powers of the airspeed, and the trim is integrated over the airspeed.
 """
 
 from collections.abc import Mapping
@@ -110,12 +110,12 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
     """Return an airframe at `ratio` times its trim speed V0, with the same states and units.
 
     Moments caused by an angle of incidence or by a surface grow with V^2, and dampings with V. The
-    effect of a force on an angle of incidence grows with the force over V. Thrust, gravity and
-    kinematics stay the same, and so does lift, which equals the weight. Every entry is scaled by a
-    power of the ratio: EXPONENTS, OF_SURFACE, and OF_THRUST for the input `thrust`. Wind acts
-    through the new A. The derivatives are taken at the trim, without an effect of Mach number and
-    C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and Simulation", 2.6, dimensional
-    derivatives. Raises as `exponents` does.
+    effect of a force on an angle of incidence is proportional to the force over V. The forces of
+    thrust and gravity stay the same, and so does lift, which equals the weight. Every entry is
+    scaled by a power of the ratio: EXPONENTS, OF_SURFACE, and OF_THRUST for the input `thrust`.
+    Wind acts through the new A. The derivatives are taken as independent of the Mach number and of
+    C_L, although C_L changes with V. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and
+    Simulation", 2.6, dimensional derivatives. Raises as `exponents` does.
     """
     powers = exponents(airframe, thrust)
     wind = ratio ** (powers.wind + 1.0)  # the file gives the effect of wind per w / V0
@@ -137,10 +137,10 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
 
         (A + gravity) dx + B du = 0
 
-    In level flight dx consists of the step dV and of dalpha = dtheta, and the other states keep
-    their values. The airspeed changes in TRIM_STEPS steps. Each step takes A, gravity and B at its
-    middle airspeed. If several inputs can keep the trim, each step takes the smallest (dalpha, du).
-    Raises as `exponents` does.
+    The equation is solved by least squares. In level flight dx consists of the step dV and of
+    dalpha = dtheta, and the other states keep their values. The airspeed changes in TRIM_STEPS
+    steps. Each step takes A, gravity and B at its middle airspeed. If several inputs can keep the
+    trim, each step takes the smallest (dalpha, du). Raises as `exponents` does.
     """
     names = list(airframe.states)
     powers = exponents(airframe, thrust)

@@ -121,15 +121,19 @@ def read_model(
     speed: float | None,
     body: Mapping[str, str | float],
 ) -> ToolModel:
-    """Read the model from a `source` of `import_airframe`. Raises ParameterError."""
+    """Read the model from a `source` of `import_airframe`.
+
+    Raises ParameterError if the file cannot be read or has none of the known forms, or if an
+    argument is given that this form does not need.
+    """
     no_body = "none: it belongs to AVL's stability derivatives"
     if not isinstance(source, str | Path):
-        require(not body, next(iter(body), ""), "it beside a state space", no_body)
+        require(not body, next(iter(body), ""), "a value beside a state space", no_body)
         return _state_space(source, states, inputs)
     path = as_path(source, "source", "a state space, or the path of a file")
     content = read_file(path, f"model {path}", "a model: .mat, .yaml, or a text of AVL or XFLR5")
     if path.suffix == ".mat":
-        require(not body, next(iter(body), ""), "it beside a MAT-file", no_body)
+        require(not body, next(iter(body), ""), "a value beside a MAT-file", no_body)
         return _matlab(path, states, inputs)
     text = content.decode("utf-8", errors="replace")
     if re.search(r"\bCLa\s*=", text) and re.search(r"\bSref\s*=", text):
@@ -140,7 +144,7 @@ def read_model(
             "none: the states are V, alpha, q, theta, beta, p, r, phi",
         )
         return _avl_derivatives(text, inputs, speed, body)
-    require(not body, next(iter(body), ""), f"it beside {path.name}", no_body)
+    require(not body, next(iter(body), ""), f"a value beside {path.name}", no_body)
     if "Longitudinal state matrix" in text or "Lateral state matrix" in text:
         return _xflr5(text, states, inputs)
     if (header := _avl_header(text)) is not None:

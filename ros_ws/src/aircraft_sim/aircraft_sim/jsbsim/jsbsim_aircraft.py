@@ -269,8 +269,8 @@ def require_aircraft(airframe: str) -> str:
     """Return the name in "jsbsim:NAME", or the absolute path of the model in "jsbsim:PATH".
 
     PATH is the XML file of a model, or its folder. A text with a "/", or that ends with ".xml", is
-    taken as a PATH. Raises ParameterError. For an unknown name, the message has the closest known
-    name. For a path, it says what is there.
+    taken as a PATH. Raises ParameterError if there is no such aircraft. For an unknown name, the
+    message has the closest known name. For a path, it says what is there.
     """
     name = airframe.removeprefix(PREFIX)
     if "/" in name or name.endswith(SUFFIX):
@@ -311,7 +311,10 @@ def root_of(model: Path) -> Path:
 
 
 def _model_file(path: Path, airframe: str) -> Path:
-    """Find the XML file of a model from its path or its folder. Raises ParameterError."""
+    """Find the XML file of a model from its path or its folder.
+
+    Raises ParameterError if the file is no model, or if the folder does not have exactly one.
+    """
     expected = "the XML file of an aircraft of JSBSim (fdm_config), or its folder"
     if not path.is_dir():
         require(path.is_file(), "airframe", f"{airframe!r}, where no file is", expected)

@@ -72,7 +72,7 @@ class Fault(NamedTuple):
 
 
 def read_fault(sentence: str, key: str) -> Fault:
-    """Read a fault from a sentence. Raises ParameterError."""
+    """Read a fault from a sentence. Raises ParameterError if it does not have the FORM."""
     words = sentence.split()
     require(len(words) in {3, 4}, key, repr(sentence), FORM)
     name, kind_name, at, *how = words

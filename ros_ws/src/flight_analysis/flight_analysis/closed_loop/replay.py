@@ -159,7 +159,7 @@ def recorded_parameters(scenario: StoredFile, namespace: str | None = None) -> C
 def is_controller_alone(scenario: StoredFile) -> bool:
     """Return whether a file has a section for the controller but none for an aircraft.
 
-    Raises ParameterError.
+    Raises ParameterError if the file is no parameter file.
     """
     names = ("controller", "aircraft")
     schemas = {name: SCHEMAS[name] for name in names}
@@ -356,7 +356,8 @@ def _recorded(
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
     """Return the tape of a run, the controller's parameters, and their changes in flight.
 
-    If `parameters` or `changes` are None, they are read from the run. Raises ParameterError.
+    If `parameters` or `changes` are None, they are read from the run. Raises ParameterError if they
+    are missing or invalid there.
     """
     if isinstance(run, Tape):
         if parameters is None and isinstance(run.scenario, Scenario):

@@ -245,12 +245,18 @@ def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
 
 
 def parse_scenario(content: bytes, path: Path) -> Scenario:
-    """Parse and validate a scenario, given the content of its file. Raises ParameterError."""
+    """Parse and validate a scenario, given the content of its file.
+
+    Raises ParameterError if the content is no valid scenario.
+    """
     return scenario_of(path.stem, path, parse_scenario_sections(content, path))
 
 
 def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]) -> Scenario:
-    """Build and validate a scenario from the values of its sections. Raises ParameterError."""
+    """Build and validate a scenario from the values of its sections.
+
+    Raises ParameterError if a value is not permitted, or if the sections do not fit together.
+    """
     parameters: dict[str, Any] = {
         key: schema.validate_mapping(sections.get(key, {}), key)
         for key, schema in SCHEMAS.items()
@@ -263,10 +269,11 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
 
 
 def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = None) -> Sections:
-    """Parse the sections of a scenario file, without validating them. Raises ParameterError.
+    """Parse the sections of a scenario file, without validating their values.
 
-    `namespace` is the namespace of the nodes, as in `parse_sections`. `find_files` finds the files
-    that the sections name.
+    Raises ParameterError if the content is no parameter file, or lacks a section. `namespace` is
+    the namespace of the nodes, as in `parse_sections`. `find_files` finds the files that the
+    sections name.
     """
     sections = parse_sections(content, path, SCHEMAS, OPTIONAL, namespace)
     find_files(sections, path)
@@ -391,7 +398,7 @@ def _yaml_values(values: Any) -> Any:
 
 
 def check_together(scenario: Scenario) -> None:
-    """Check that the channels and rates of the sections fit together. Raises ParameterError."""
+    """Raise ParameterError if the channels and rates of the sections do not fit together."""
     channels = scenario.aircraft.channels()
     controller = scenario.controller
     reference = scenario.reference_model

@@ -162,10 +162,10 @@ def input_margins(
 
     For N aircraft, the plant has A (N, n, n) and B (N, n, m), and the law is either common or one
     for each aircraft. Crossings that are found on the grid of frequencies are refined to rounding,
-    and peaks to 1e-3 of their height. The phase margin is the smallest abs(angle(-L_i)) at
-    abs(L_i) = 1. The gain margins are the values of 1 / abs(L_i) at real L_i < 0 that are next to 1
-    on either side. The disk margin of an input is 1 / max_w abs(S_ii - 1/2). With independent disks
-    in all inputs at once, it is
+    and peaks to 1e-3 of their height. The phase margin is the smallest abs(angle(-L_i)) at abs(L_i)
+    = 1. At real L_i < 0 a gain factor of 1 / abs(L_i) makes the loop pass through -1. The gain
+    margins are the largest such factor below 1, and the smallest above 1. The disk margin of an
+    input is 1 / max_w abs(S_ii - 1/2). With independent disks in all inputs at once, it is
 
         1 / max_w min_D norm(D (S - I/2) D^-1, 2),  D diagonal
 

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the figures of a flight from its tape. A figure is None if the tape lacks its signals.
+"""Draw the figures of a flight from its tape.
 
-The figures do not depend on the kind of aircraft: channels are drawn under their own names.
+A figure is None if the tape lacks its signals. Only the figures of tracking and of the error need y
+and y_m. The figures do not depend on the kind of aircraft: channels are drawn under their own
+names.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -50,6 +52,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
+# Colours of curves on a light page, by what the curve shows.
 PLANT = "#123c52"
 REFERENCE = "#d97b1c"
 ERROR = "#8b1f4f"
@@ -58,8 +61,8 @@ WIND = "#2a7f62"
 END_STOP = "#8c8c8c"
 LIMIT = "#444444"
 # Every line has a contrast of at least 3 to 1 with its page, as WCAG 2.2 requires of graphics
-# (1.4.11). The colours are those of Okabe and Ito 2008, which the colour blind can tell apart,
-# without the orange of REFERENCE. On a dark page they are lighter.
+# (1.4.11). The colours of flights are the blue, the green and the pink of Okabe and Ito 2008, which
+# the colour blind can tell apart, and a violet and an olive. On a dark page they are lighter.
 FLIGHTS = {
     "#0072b2": "#4db3ea",
     "#5e3c99": "#b39ddb",
@@ -87,7 +90,8 @@ MIN_SPECTRUM_SAMPLES = 64
 HISTOGRAM_BINS = 80
 # tick marks of the frequency axis of a spectrum, Hz
 FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]
-# share of the time axis, about two pixels, to which a shorter interval is lengthened
+# share of an axis, about two pixels: a shorter interval is lengthened to it, and a lower noise
+# floor is not drawn
 MIN_VISIBLE_FRACTION = 1 / 500
 MOST_MARKED = 100  # largest number of marked messages, because plotly is slow with more shapes
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view if it is at most this many times the largest u
@@ -102,8 +106,9 @@ SAME_CURVE_TOLERANCE = 1e-3
 def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
     """Return what all figures of one or several flights share, such as units and shaded times.
 
-    For one flight, the figures shade gusts, failsafe modes, faults and gaps. For several flights,
-    they shade only the gusts, and only if all flights had the same gusts.
+    For one flight, the figures shade gusts, failsafe modes, faults, spans in which the host was too
+    busy, and gaps, and they mark messages. For several flights, they shade only the gusts, and only
+    if all flights had the same gusts.
     """
     longest = max((flight.tape for flight in flights), key=flight_end)
     end = flight_end(longest)
@@ -116,14 +121,16 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
         intervals += fault_intervals(flights[0], end)
         intervals += starved_intervals(flights[0])
         intervals += gap_intervals(longest)
-    of_one = flights[0].message_times if len(flights) == 1 else []
+    message_times = flights[0].message_times if len(flights) == 1 else []
     return PlotContext(
         runs=runs_of(flights),
         units=common_units(flights),
         intervals=intervals,
         end=end,
         samples=SampleStore(),
-        messages=[time for time in dict.fromkeys(of_one) if 0.0 <= time <= end][:MOST_MARKED],
+        messages=[time for time in dict.fromkeys(message_times) if 0.0 <= time <= end][
+            :MOST_MARKED
+        ],
     )
 
 
@@ -242,10 +249,10 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
 def input_figure(
     context: PlotContext, limits: Mapping[str, Limits] = MappingProxyType({})
 ) -> Figure | None:
-    """Draw the command u and the actuator positions, or only u for several flights.
+    """Draw the command u and, for one flight, the actuator positions, limits and saturation.
 
-    `limits` has the limits of the inputs by kind. At most two kinds are drawn, as lines. Marks show
-    where an input was saturated.
+    The positions are left out if the tape has none. `limits` has the limits of the inputs by kind.
+    At most two kinds are drawn, as lines. Marks show where an input was saturated.
     """
     curves = _curves(context, "u", lambda tape: tape.signals.get("u"), is_held=True)
     if context.is_comparison or not curves:
@@ -259,7 +266,7 @@ def input_figure(
     figure = time_series_figure(context, curves)
     for index, name in enumerate(in_order(tape["u"].names, context.units)):
         factor = context.units.get(name, NO_UNIT).factor
-        # The limits are lines over the whole time.
+        # The axis shows all curves, and the limits near them.
         values = [
             curve.signal[name] * factor for curve in curves.values() if name in curve.signal.names
         ]
@@ -396,7 +403,7 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
     samples: dict[str, FloatArray] = {}
     if "internals" in tape:
         periods = tick_periods(tape)
-        samples["tick to tick, off a whole period"] = (
+        samples["time between ticks, less whole periods"] = (
             periods - period_ns * np.round(periods / period_ns)
         ) / 1e6
         samples["tick after its deadline"] = tape["internals"]["late"] * 1e3
@@ -486,7 +493,7 @@ def sensor_figure(context: PlotContext) -> Figure | None:
 def tick_figure(context: PlotContext) -> Figure | None:
     """Draw the lateness, the age of y and the dt of the controller's ticks.
 
-    Returns None if each tick was in time and had a fresh y.
+    Returns None if each tick was in time and had a fresh y, and all dt are equal.
     """
     tape = context.tape
     channels = ("late", "age", "dt")

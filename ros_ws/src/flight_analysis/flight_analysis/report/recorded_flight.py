@@ -71,7 +71,8 @@ def read_accounted(
     files, compressed or not. A truncated MCAP file is read up to the last complete chunk.
 
     In the result, `tape.account` has the number of samples of each topic, and `tape.notes` say what
-    the log lacks. A log without a scenario has no account, unless it was imported.
+    the log lacks. An imported log needs no scenario for its account. Any other log has no account
+    if it lacks a scenario that can be read, and no log has one without a topic of an aircraft.
 
     Args:
         run: Folder of a run, or a file of the bag.
@@ -113,7 +114,8 @@ def read_flight(
     If `outcome` is None, the outcome is the one that the log, the summary or a launch stated, or
     the one that the samples show. `namespace`, `scenario` and `remaps` have the same meaning as in
     `read_accounted`. Raises ParameterError if the log cannot be read, or if it has no scenario and
-    was not imported, and UnflownError if it lacks y or y_m.
+    was not imported. If a flight of a scenario lacks y or y_m, UnflownError is raised. An imported
+    log, and a log of the user's own aircraft, need y and u, else ParameterError is raised.
     """
     return flight_of(read_run(run, namespace, scenario, remaps), run, outcome)
 
@@ -140,7 +142,7 @@ def log_account(recorded: RecordedRun) -> Account | None:
 
 
 def scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
-    """Return the scenario that is stored in a log.
+    """Return the scenario that is stored in a log, or the scenario that `read_run` got instead.
 
     Its relative paths begin in the folder of the log. Raises ParameterError if the log has no valid
     scenario.
@@ -159,7 +161,7 @@ def flight_of(recorded: RecordedRun, run: Path, outcome: Outcome | None = None) 
     if (source := recorded.metadata.get(IMPORTED)) is not None:
         return _imported_flight(recorded, name, source)
     if is_controller_alone(recorded.scenario_file()):
-        return _own_flight(recorded, name, outcome or recorded.tape.outcome)
+        return _own_aircraft_flight(recorded, name, outcome or recorded.tape.outcome)
     scenario = scenario_in(recorded, run)
     outcome = outcome or _previous_outcome(recorded, folder_of(run), scenario)
     return _scenario_flight(recorded, run, name, scenario, outcome)
@@ -168,9 +170,9 @@ def flight_of(recorded: RecordedRun, run: Path, outcome: Outcome | None = None) 
 def _imported_flight(recorded: RecordedRun, name: str, source: Mapping[str, str]) -> RecordedFlight:
     """Return the flight of an imported log. Only its y and u can be summarised."""
     recorded.require("y", "u")
-    is_alone = recorded.scenario is None
+    has_no_scenario = recorded.scenario is None
     expected = "none: an imported log flew no scenario"
-    require(is_alone, "scenario", "a scenario for an imported log", expected)
+    require(has_no_scenario, "scenario", "a scenario for an imported log", expected)
     return RecordedFlight(
         name=name,
         scenario=None,
@@ -180,7 +182,7 @@ def _imported_flight(recorded: RecordedRun, name: str, source: Mapping[str, str]
     )
 
 
-def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
+def _own_aircraft_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
     """Return the flight of a user's own aircraft. The log describes only the controller."""
     recorded.require("y", "u")
     controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
@@ -202,11 +204,11 @@ def _scenario_flight(
         outcome = NEVER_ENGAGED
     if "guidance" in log:
         require_channels(log["guidance"].names)
-    # The account covers the whole log, but the metrics only its engaged part.
+    # The account covers the whole log. The metrics cover the engaged part, or the whole flight if
+    # the engaged part is too short to contain y and y_m.
     tape = until_last_tick(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged_part = _engaged(tape, engagements or [])
-    # A short engagement may contain no sample.
     is_y_engaged = {"y", "y_m"} <= set(engaged_part.signals)
     part = engaged_part if is_y_engaged else tape
     try:
@@ -337,8 +339,8 @@ def _stated_outcomes(recorded: RecordedRun, folder: Path | None) -> Iterator[Out
         # show in the log of one aircraft.
         yield replace(recorded.tape.outcome, shortfalls=in_summary.shortfalls)
         yield in_summary
-    # A launch leaves a file with its outcome beside the log. It counts only if the log is named
-    # after the folder.
+    # A launch leaves a file with its outcome beside the log. It counts only if the folder has a log
+    # that is named after it, as a launch names its log.
     if (folder / f"{folder.name}_0.mcap").is_file():
         with suppress(ParameterError):
             content = read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "an outcome")

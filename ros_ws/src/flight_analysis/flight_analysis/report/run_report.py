@@ -96,7 +96,8 @@ def _written(
     """Write the files of a report into a folder, and return the flight with its paths.
 
     `kept_scenario` is the scenario of the log, or None if it is not written to a file. If
-    `is_latest` is True, runs/latest becomes a link to the folder. Raises UnwrittenReportError.
+    `is_latest` is True, runs/latest becomes a link to the folder. Raises UnwrittenReportError if a
+    file cannot be written.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 

@@ -23,11 +23,12 @@ PLACE = ("north", "east", "altitude")  # m
 
 
 class Track(NamedTuple):
-    """The positions of an aircraft over time, in the channels of PLACE, and their origin."""
+    """Where an aircraft was: its positions over time in the channels of PLACE."""
 
     start_ns: int  # stamp of t = 0 of this aircraft's flight
     place: Signal
-    origin: tuple[float, ...] | None = None  # origin of the map
+    # origin of the map, from which the positions are measured
+    origin: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, order=True)

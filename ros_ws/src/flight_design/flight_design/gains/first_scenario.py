@@ -222,7 +222,7 @@ def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
 
     If the file has only this section, the commands, gusts and rate limits come from the scenario
     COMMANDED. The aircraft in COMMANDED may differ from the aircraft that the controller is for.
-    Raises ParameterError.
+    Raises ParameterError if the scenario is missing or invalid.
     """
     controller = controller_alone(scenario)
     if controller is None:

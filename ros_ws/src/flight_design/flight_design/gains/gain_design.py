@@ -317,7 +317,8 @@ def _loop(
 
     `rate` and `y_rate` are rates of the law and of y, Hz; `lag` and `delay` are in s. The law runs
     once per sample of y, so sampling causes a lag of 1.5 periods of y. The loop includes only 1.5
-    periods of the law, so the difference is added to the delay. Raises ParameterError.
+    periods of the law, so the difference is added to the delay. Raises ParameterError if a rate,
+    the delay or a lag is out of its range.
     """
     loop = gain_selection.loop_setting(scenario)
     if rate is not None:

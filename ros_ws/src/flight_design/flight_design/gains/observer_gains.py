@@ -97,7 +97,8 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
     """Read gains from a file that has the fields of ObserverGains and Weights by name, each a list.
 
     T is the total lag, (m,), s. `axes` is the number of axes of the wind, and `states` is the
-    number of states of the model. Raises ParameterError.
+    number of states of the model. Raises ParameterError if the file cannot be read, if it has other
+    names, or if a list has another length or a number that is not above 0.
     """
     m = len(T)
     lengths: dict[str, tuple[int, ...]]

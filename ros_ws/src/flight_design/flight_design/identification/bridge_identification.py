@@ -365,7 +365,7 @@ def measured_trims(
     rows = channel_map.inputs.items()
     return {
         name: to_channel(
-            float(np.median(would_send[f"{row.message}.{row.field}"][still])), row.line
+            float(np.median(would_send[f"{row.message}.{row.field}"][still])), row.conversion
         )
         for name, row in rows
     }
@@ -383,7 +383,7 @@ def within_range(
     sentences = []
     for name, trim in trims.items():
         row = channel_map.inputs[name]
-        low, high = sorted(to_channel(raw, row.line) for raw in row.range)
+        low, high = sorted(to_channel(raw, row.conversion) for raw in row.range)
         key = f"map {channel_map.name}: inputs.{name}"
         way_on = "fly slower, or trim the aircraft otherwise"
         require(

@@ -22,7 +22,7 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification.parameter_agreement import (
-    SAME_LINE,
+    SAME_VALUE,
     Agreement,
     Servo,
     Stick,
@@ -278,7 +278,7 @@ def _messages(log: VehicleLog, quantity: str) -> str:
 
 
 class _Reader(NamedTuple):
-    """Reads the command of an input from a log, and converts it to SI by `line`.
+    """Reads the command of an input from a log, and converts it to SI by `conversion`.
 
     For a plane of ArduPilot, the command is first computed from the pulse of the stick or of the
     servo.
@@ -286,7 +286,7 @@ class _Reader(NamedTuple):
 
     log: VehicleLog
     source: LogField
-    line: LinearConversion
+    conversion: LinearConversion
     stick: Stick | None = None
     servo: Servo | None = None
 
@@ -299,10 +299,12 @@ class _Reader(NamedTuple):
         if self.stick is not None and self.servo is not None:
             values = self.stick.raw(self.servo.deflection(values, self.stick))
         before = (
-            self.stick.trim_line if self.stick is not None and self.servo is None else SAME_LINE
+            self.stick.trim_conversion
+            if self.stick is not None and self.servo is None
+            else SAME_VALUE
         )
         return np.array(
-            [to_channel(to_channel(value, before), self.line) for value in values.tolist()]
+            [to_channel(to_channel(value, before), self.conversion) for value in values.tolist()]
         )
 
 
@@ -331,7 +333,7 @@ def _commands(
             "a ULog",
             "a log of ArduPilot: in a ULog the setpoints of torque and thrust are the commands",
         )
-        return _Reader(log, source, row.line)
+        return _Reader(log, source, row.conversion)
     if log.vehicle is VehicleKind.MULTICOPTER:
         return _torque(log, name, row, servos)
     stick = stick_of(channel_map, name)
@@ -352,7 +354,7 @@ def _commands(
         f"no {source.message}.{source.field} in the log",
         expected,
     )
-    return _Reader(log=log, source=source, line=row.line, stick=stick, servo=servo)
+    return _Reader(log=log, source=source, conversion=row.conversion, stick=stick, servo=servo)
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:

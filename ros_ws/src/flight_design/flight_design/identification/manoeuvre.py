@@ -16,13 +16,14 @@ from flight_analysis.metrics.errors import best_error, error_metrics
 from flight_core.tape import Tape
 
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
-"""Heights of the pulses of the outputs, SI. `IdentifiedAircraft.coupling` is measured in these
-units. For an output without a pulse, the largest rms error in calm air of an aircraft that flies is
-its height."""
+"""Heights of the pulses of the outputs, SI. `IdentifiedAircraft.coupling` is relative to these
+heights. For an output without a pulse, an aircraft only counts as flying if the rms error in calm
+air is below the height."""
 GUST_SPEED = 5.0  # m/s, downwards
 GUST_LENGTH = 30.48  # m, 100 ft to the peak; FAR/CS 25.341 has 30 to 350 ft
+# With guidance, this turn and this climb are commanded in place of the pulses.
 TURN = math.pi / 2.0  # rad
-CLIMB = 100.0  # m. With guidance, a turn and a climb are commanded in place of the pulses.
+CLIMB = 100.0  # m
 # s, instants at which the turn and the climb begin
 TURN_START = 2.0
 CLIMB_START = 30.0
@@ -32,7 +33,8 @@ def moderate_turbulence(altitude: float) -> dict[str, Any]:
     """Return the parameters of moderate turbulence at an altitude, m.
 
     At low altitude the turbulence follows from the wind near the ground. At high altitude the rms
-    of the turbulence is 10 ft/s.
+    of the turbulence is 10 ft/s. Between LOW and HIGH the result has both. Altitudes below LOWEST
+    count as LOWEST.
     """
     values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
     if altitude < HIGH:
@@ -44,7 +46,7 @@ def moderate_turbulence(altitude: float) -> dict[str, Any]:
 
 LEAST_SHARE = 0.01
 """Share of the ticks from which an input counts as at its limit. It is 0.6 s of a flight of a
-minute, which is longer than the beginning of a step."""
+minute, so an input that is at its limit only at the beginning of a step does not count."""
 
 
 class ManoeuvreResult(NamedTuple):
@@ -54,7 +56,7 @@ class ManoeuvreResult(NamedTuple):
     rms: dict[str, float]  # rms of the error by output, SI
     largest: dict[str, float]  # largest abs(u) by input
     # share of the ticks in which an input was at its limit, by input, if it is LEAST_SHARE or more
-    at_stop: dict[str, float]
+    at_limit: dict[str, float]
 
     @property
     def text(self) -> str:
@@ -62,7 +64,7 @@ class ManoeuvreResult(NamedTuple):
         return ", ".join(
             [
                 self.outcome,
-                *(f"{name} at its stop {share:.0%}" for name, share in self.at_stop.items()),
+                *(f"{name} at its limit {share:.0%}" for name, share in self.at_limit.items()),
             ]
         )
 
@@ -70,7 +72,7 @@ class ManoeuvreResult(NamedTuple):
 def fly_all(
     scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, ManoeuvreResult]:
-    """Fly a scenario that `identify` has written three times.
+    """Fly a scenario of `identify` three times.
 
     The flights are in "calm" air, with the "gust" of the scenario, and in moderate "turbulence"
     without the gust.
@@ -95,5 +97,5 @@ def manoeuvre_result(tape: Tape) -> ManoeuvreResult:
         name: float(np.max(np.abs(tape["u"][name]), initial=0.0)) for name in tape["u"].names
     }
     shares = {name: kinds["magnitude"] for name, kinds in saturation_shares(tape).items()}
-    at_stop = {name: share for name, share in shares.items() if share >= LEAST_SHARE}
-    return ManoeuvreResult(str(tape.outcome), rms, largest, at_stop)
+    at_limit = {name: share for name, share in shares.items() if share >= LEAST_SHARE}
+    return ManoeuvreResult(str(tape.outcome), rms, largest, at_limit)

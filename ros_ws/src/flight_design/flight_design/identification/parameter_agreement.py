@@ -28,8 +28,8 @@ CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")
 AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}
 # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
 FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}
-# line of an input without a row of `trims`: its raw value is the pulse
-SAME_LINE = LinearConversion(1, 1.0, 0.0)
+# conversion of an input without a row of `trims`: its raw value is the pulse
+SAME_VALUE = LinearConversion(1, 1.0, 0.0)
 
 # Largest difference of an end of the range, as a share of half the range. The effect of the input
 # differs by the same share, which is less than the standard errors of `identify`.
@@ -61,12 +61,12 @@ MENDS = {
 class Stick(NamedTuple):
     """What a channel map says about an input and its channel of the transmitter.
 
-    `trim_line`, from the input's row of `trims`, converts the pulse, us, to the raw value.
+    `trim_conversion`, from the input's row of `trims`, converts the pulse, us, to the raw value.
     """
 
     axis: str  # ROLL, PITCH, THROTTLE or YAW
     channel: int  # channel of the transmitter, from 1
-    trim_line: LinearConversion
+    trim_conversion: LinearConversion
     raw_range: tuple[float, float]
     raw_sign: int  # +1 if a higher raw value is roll right, nose up, more thrust, nose right
 
@@ -77,11 +77,11 @@ class Stick(NamedTuple):
 
     def parameters(self) -> dict[str, tuple[float, float]]:
         """Return which parameters of ArduPilot the map asks for: (value, tolerance) by name."""
-        low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
+        low, high = sorted(to_raw(raw, self.trim_conversion) for raw in self.raw_range)
         half = (high - low) / 2.0
         name = f"RC{self.channel}"
         trim = {f"{name}_TRIM": (low + half, TRIM_TOLERANCE * half)} if self.is_centred else {}
-        is_reversed = self.raw_sign * self.trim_line.sign < 0
+        is_reversed = self.raw_sign * self.trim_conversion.sign < 0
         return {
             f"RCMAP_{self.axis}": (float(self.channel), 0.0),
             f"{name}_MIN": (low, END_TOLERANCE * half),
@@ -120,7 +120,7 @@ def stick_of(channel_map: ChannelMap, name: str) -> Stick:
     return Stick(
         axis=AXES[responds],
         channel=channel,
-        trim_line=SAME_LINE if trim is None else trim.line,
+        trim_conversion=SAME_VALUE if trim is None else trim.conversion,
         raw_range=row.range,
         raw_sign=raw_sign,
     )

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Convert u so that actuators with a lag of first order move as other servos would.
+"""Convert u so that a first-order model of an actuator moves as a better model of a servo.
 
-The servos may be late, of second order, and limited in rate. An actuator has no noise, so its
-position follows from u alone. The filters can therefore keep the actuators of first order. Their
-input is a u with which these actuators have the position of the servo at each tick.
+The better model has a delay, an inertia and a limited rate. The first-order model gets the result
+of the conversion as its input, and then has the position of the servo at each tick. This is
+possible because an actuator has no noise, so its position follows from u alone. The filters in
+`innovation_filters` can therefore keep their first-order actuators.
 """
 
 import numpy as np
@@ -14,8 +15,8 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import delayed
 from rise_di_controller.law.linear_loop import zero_order_hold
 
-# Least inertia of a servo, as a share of the square of its lag. It is far below the step of the
-# finite differences.
+# Least inertia of a servo, as a share of the square of the lag of the first-order actuator. It is
+# far below the step in `inertia` with which the search takes finite differences.
 LEAST_INERTIA = 1e-5
 
 
@@ -58,20 +59,20 @@ def behind_servo(
     inertia: float,
     rate_limit: float = np.inf,
 ) -> FloatArray:
-    """Return the u, (T,), with which a first-order actuator moves as a given servo, at each tick.
+    """Return the input, (T,), with which a first-order actuator moves as a servo with the input u.
 
         inertia lag^2 p_ddot + servo_lag p_dot + p = u,   abs(p_dot) <= rate_limit
 
-    p is the position of the servo, and `lag` is the lag of the first-order actuator, s. The servo
-    is at rest at the first u. Without an inertia the servo is of first order. If the actuator has
-    no lag, the servo has no inertia and no rate limit.
+    p is the position of the servo, and `lag` is the lag of the first-order actuator, s. Both have
+    the same position at each tick. The servo is at rest at the first u. Without an inertia the
+    servo is of first order. If `lag` is 0, the result is u, whatever the servo.
     """
     if lag == 0.0:
         return u
     square = max(inertia, LEAST_INERTIA) * lag**2
     motion = np.array([[0.0, 1.0], [-1.0 / square, -servo_lag / square]])
     Phi, Gamma = zero_order_hold(motion, np.array([[0.0], [1.0 / square]]), period)
-    # position at the next tick over u
+    # transfer function from u to the position at the next tick
     numerator = [Gamma[0, 0], Phi[0, 1] * Gamma[1, 0] - Phi[1, 1] * Gamma[0, 0]]
     denominator = [1.0, -np.trace(Phi), np.linalg.det(Phi)]
     position = np.asarray(signal.lfilter(numerator, denominator, u - u[0]))

@@ -11,17 +11,20 @@ from scipy.optimize import least_squares
 from flight_core.vectors import FloatArray
 
 MAX_DELAY = 0.3  # s, largest delay in the fit
-# An eigenvalue of the normal equations below this fraction of the largest eigenvalue is a rounding
-# error.
+# This fraction of a covariance's largest eigenvalue is added to all of its eigenvalues, because
+# smaller ones are rounding errors.
 RANK = 1e-10
 MAX_LAG = 1.0  # s, largest lag in the fit
 RESOLUTION = 0.025  # s, time between the points of the step response that are fitted
-# error that the windows and the linear model leave, as a share of the step response's largest value
+# error that the windows of `response_identification` and the linear model leave, as a share of the
+# step response's largest value
 FLOOR = 0.01
 STARTS_DELAY = (0.02, 0.1, 0.2)  # s
 STARTS_LAG = (0.03, 0.2)  # s; the search starts from each pair
-# Bounds of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2 and slow part. Omega and the slow
-# part are relative to the largest value of the step response.
+# The fitted response is Omega times the first response of `second_order_response`, plus the slow
+# part times the second one. The bounds belong to delay, s, lag, s, Omega, damping, 1/s,
+# stiffness, 1/s^2, and slow part. Omega and the slow part are relative to the largest value of the
+# response.
 LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
 UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
 SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])  # typical sizes, which scale the search
@@ -30,8 +33,8 @@ SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # prior standard devia
 # second order.
 ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))
 MIN_GAIN = 6.0  # decrease of chi squared per additional parameter that a higher order must bring
-# Relative change of chi squared at which a search ends. It has no effect on MIN_GAIN or on a
-# standard error.
+# Relative change of chi squared at which a search ends. It is so small that it changes neither the
+# order that is chosen by MIN_GAIN nor a standard error.
 TOLERANCE = 1e-6
 EARLY = 0.3  # s after delay and lag; the response until then decides on the sign of Omega_jj
 # s after delay and lag; the responses of the other outputs until then give the rest of Omega
@@ -47,11 +50,13 @@ class ResponseColumn(NamedTuple):
     lag_deviation: float
     delay: float
     delay_deviation: float
-    sign_ratio: float  # size of the driven output's response, in standard errors
+    # How certain the sign of Omega_jj is: the size of the early response of the driven output, in
+    # standard errors, or 0 if this response begins with the other sign
+    sign_ratio: float
 
 
 def no_column(m: int) -> ResponseColumn:
-    """Return a column of NaN, for an input without a result."""
+    """Return a column of NaN with a `sign_ratio` of 0, for an input without a result."""
     return ResponseColumn(
         Omega=np.full(m, np.nan),
         deviation=np.full(m, np.nan),
@@ -90,7 +95,8 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
     """Fit delay, lag and Omega_jj of input j to output j, then Omega_ij to the other outputs.
 
     The fit takes the same delay and lag for the other outputs. t has shape (N,), and `responses` (1
-    + DRAWS, N, m). The first of the responses is the estimate.
+    + DRAWS, N, m). The first response is the estimate, and the others are draws that show its error
+    (`response_identification`).
     """
     step = responses[0]
     size = max(float(np.max(np.abs(step[:, j]))), np.finfo(float).tiny)
@@ -103,7 +109,8 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
         ) and has_direction_of_Omega(t, trial.theta):
             best = trial
     inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
-    # source: R. T. Birge, Phys. Rev. 40, 1932
+    # Standard errors grow by the Birge ratio, the root of chi squared per degree of freedom.
+    # Source: R. T. Birge, Phys. Rev. 40, 1932.
     misfit = max(best.chi_squared / max(len(t) - sum(best.free), 1), 1.0)
     deviation = np.array([RESOLUTION, RESOLUTION, *np.zeros(4)])
     J = best.jacobian[:, inside]
@@ -137,8 +144,8 @@ def has_direction_of_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N
     """Return whether a fitted response begins in the direction of Omega.
 
     The direction is the sign of the sum of the response, up to the time EARLY after the delay and
-    the lag. If this is not the sign of Omega, the slow term makes up the whole response. The two
-    fitted poles then stand for a pole and a lag, and Omega is about 0.
+    the lag. If this is not the sign of Omega, the response consists of the slow part alone. One of
+    the two fitted poles then repeats the lag, and the true Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(
@@ -148,7 +155,7 @@ def has_direction_of_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N
 
 
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Return by how much a fitted response lowers chi squared, minus its number of parameters.
+    """Return by how much a fitted response lowers chi squared, minus 6 for its parameters.
 
     The response is examined up to the time EARLY after the delay and the lag. A negative result
     becomes 0. The result is also 0 if the response does not begin with the sign of Omega.
@@ -181,6 +188,7 @@ class _Curve(NamedTuple):
 
     theta: FloatArray
     free: tuple[int, ...]  # 1 for each entry of theta that is fitted, else 0
+    # sum of the squares of the whitened residuals and of theta / SPREAD
     chi_squared: float
     jacobian: FloatArray
 
@@ -193,9 +201,10 @@ def _search(
     free: tuple[int, ...],
     start: FloatArray | None,
 ) -> _Curve:
-    """Fit the free entries of theta by least squares, from several starts.
+    """Fit the free entries of theta by least squares, with the prior SPREAD around 0.
 
-    The starts are several delays and lags, and `start`.
+    `step` is the response divided by `size`, its largest value. The search starts from several
+    delays and lags, and from `start`.
     """
     fitted = np.array(free, dtype=bool)
 
@@ -211,7 +220,8 @@ def _search(
             [size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]]
         )
 
-    # Start at each pair of delay and lag, with the other entries by least squares.
+    # Start at each pair of delay and lag, with a damping of 2 1/s, no stiffness, no slow part, and
+    # Omega by least squares.
     starts = [] if start is None else [start]
     for delay in STARTS_DELAY:
         for lag in STARTS_LAG:

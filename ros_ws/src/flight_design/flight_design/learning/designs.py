@@ -26,12 +26,14 @@ from rise_di_controller.rise_di_config import DEFAULT_MARGIN, RiseDiConfig
 # s, delay margin that is kept beyond the latest delay. A loop with 30 ms flew well while u was 20
 # ms late.
 DELAY_LEFT = 0.01
-# Weight of the activity of u in the cost of a design for a learned model. A design for a model with
-# errors has 1. If learned models had 1 too, the loops would have 5 ms more delay margin than the
-# loop of the file, and 2 % more error. A weight of 0 was no better than 0.5.
+# Weight of the activity of u in the cost of a design for a learned model. A design for the
+# rough model of the airframe file has 1. If learned models had 1 too, their loops would have 5 ms
+# more delay margin than the loop for the airframe file, and 2 % more error. A weight of 0 was no
+# better than 0.5.
 ACTIVITY = 0.5
 SPEED = "V"  # the output whose observer needs the observers of the other outputs
-# How far the box of a learned model reaches in each entry, in stated standard deviations.
+# Half-width of the box of a learned model, which holds the intervals of the entries of uncertain
+# aircraft, in standard deviations of the identification.
 DEVIATIONS = 2.0
 # How far a guarantee is sought, in the same unit.
 MOST_DEVIATIONS = 4.0
@@ -43,16 +45,18 @@ class Goal(NamedTuple):
 
     margin: FloatArray  # (m,) delay margin of each input, s
     needed: Requirement
-    beside: SelectedObserver | None = None  # the design for the file, from which the search begins
+    # the design for the airframe file, from which the search begins
+    first: SelectedObserver | None = None
     is_free: Sequence[bool] | None = None  # (m,) channels whose gains may change; if None, all may
 
 
 Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
-"""Designs the feedforward and the observer for a model. Raises ParameterError."""
+"""Designs the feedforward and the observer for a model. Raises ParameterError if no design meets
+the goal."""
 
 DesignOfFile = Callable[[RiseDiConfig], SelectedObserver]
 """Designs the feedforward and the observer for the rough model, and allows for its errors. Raises
-ParameterError."""
+ParameterError if no design has the required margins."""
 
 
 class Known(NamedTuple):
@@ -74,9 +78,9 @@ class LearnedLoop(NamedTuple):
     def linear(self) -> LinearLoop:
         """Return the linear loop around the model, with a box of uncertain aircraft.
 
-        In the box, each entry deviates by up to DEVIATIONS standard deviations. The loop has no
-        limits. Every u is late by the longest delay in `known`, or by the delay in the controller's
-        parameters if this is longer.
+        In the box, each entry deviates by up to DEVIATIONS standard deviations. The loop is linear,
+        without the limits of u. Every u is late by the longest delay in `known`, or by the delay in
+        the controller's parameters if this is longer.
         """
         model = self.model
         deviation = chain.from_iterable(part.deviation.items() for part in self.known)
@@ -131,22 +135,22 @@ def is_late(start: RiseDiConfig, latest: Mapping[str, float]) -> bool:
     return max(latest.values(), default=0.0) + DELAY_LEFT > asked_margin(start)
 
 
-def price(selected: SelectedObserver, margin: float, beside: SelectedObserver, kept: float) -> str:
-    """Write a sentence on what a larger delay margin costs in tracking error.
+def price(selected: SelectedObserver, margin: float, other: SelectedObserver, kept: float) -> str:
+    """Say what a larger delay margin costs in tracking error.
 
-    `selected` is the design with the delay margin `margin`, s, and `beside` is a design that keeps
+    `selected` is the design with the delay margin `margin`, s, and `other` is a design that keeps
     only the margin `kept`, s.
     """
-    ratio = math.exp((selected.cost - beside.cost) / len(selected.relaxation))
+    ratio = math.exp((selected.cost - other.cost) / len(selected.relaxation))
     return (
-        f"{ratio:.2f} times the error of {1e3 * kept:.0f} ms of delay margin, "
-        f"since {1e3 * margin:.0f} ms are asked for"
+        f"{ratio:.2f} times the error of a design with {1e3 * kept:.0f} ms of delay margin, "
+        f"because {1e3 * margin:.0f} ms are asked for"
     )
 
 
 def goal(
     start: RiseDiConfig,
-    file: SelectedObserver | None,
+    design_of_file: SelectedObserver | None,
     model: Airframe,
     parts: Collection[tuple[str, ...]],
     latest: Mapping[str, float],
@@ -154,27 +158,31 @@ def goal(
 ) -> Goal:
     """Return the goal of a design for a model that has some learned parts.
 
-    A part is a group of states and inputs that does not couple with the rest. Each part needs a
-    delay margin:
+    A part is a group of states and inputs that does not couple with the rest. `parts` has the
+    outputs of each part. Each part needs a delay margin:
 
     - If `learn.margin` is set, it is this margin.
     - If there is no `learn.margin` and no design for the airframe file, it is the margin of the
       controller with which the flight started.
-    - With a design for the airframe file (`file`), it is the margin that the loop with this design
-      has around the learned model, but at most the margin at the start of the flight. A learned
-      part needs at least DEFAULT_MARGIN, or the margin at the start if this is smaller.
+    - If there is no `learn.margin` but a `design_of_file`, it is about the margin that the loop
+      with this design has around the learned model, but at most the margin at the start of the
+      flight. A learned part needs at least DEFAULT_MARGIN, or the margin at the start if this is
+      smaller.
 
     A `dead` output does not use this design, so it needs no margin. In any case an input must
-    tolerate DELAY_LEFT, s, beyond its `latest` delay, s. With a design for the file, the
-    sensitivity must be at most 2, or the sensitivity of the loop with this design if it is larger.
-    This bounds the phase and gain margins (Astrom, Murray, "Feedback Systems", 10.5).
+    tolerate DELAY_LEFT, s, beyond its `latest` delay, s. The sensitivity must be at most 2. This
+    bounds the phase and gain margins (Astrom, Murray, "Feedback Systems", 10.5). If the loop with
+    the `design_of_file` is stable around the model but falls short of the required sensitivity,
+    phase, gain or damping, only what it reaches is required.
     """
     outputs = start.outputs
     margin = np.full(len(outputs), margin_of(start))
     needed = OBSERVER_REQUIREMENT
     is_free = None
-    if file is not None:
-        linear = linear_loop(file.controller, model, model.matrix_a()[None], model.matrix_b()[None])
+    if design_of_file is not None:
+        linear = linear_loop(
+            design_of_file.controller, model, model.matrix_a()[None], model.matrix_b()[None]
+        )
         undelayed = linear.loop._replace(delay=0.0)
         learned = {output for part in parts for output in part}
         is_free = [output in learned for output in outputs]
@@ -188,7 +196,8 @@ def goal(
             if part in parts:
                 kept = max(kept, min(DEFAULT_MARGIN, margin_of(start)))
             else:
-                kept -= RESOLUTION  # The gains of this part stay, and with them its margin.
+                # The gains of this part stay. Its margin cannot grow, so a little less is required.
+                kept -= RESOLUTION
             margin = np.where(share > 0.0, max(kept, 0.0), margin)
         margins = input_margins(linear.nominal, linear.law, linear.loop, together=False)
         if margins.stable:
@@ -205,7 +214,7 @@ def goal(
     margin = np.where([output in dead for output in outputs], 0.0, margin)
     # 0.1 ms is the resolution of delays in the file of a scenario
     late = [round(latest[name] + DELAY_LEFT, 4) if name in latest else 0.0 for name in start.inputs]
-    return Goal(np.maximum(margin, late), needed, file, is_free)
+    return Goal(np.maximum(margin, late), needed, design_of_file, is_free)
 
 
 def by_law_of_start(
@@ -223,9 +232,9 @@ def by_law_of_start(
     - If a part has a dead input and the design for the file is in use (`has_file`), the law only
       controls the output of the dead input, and V if it is in the part.
 
-    In flights without an elevator, the observer of V erred four times as much as the law. The other
-    outputs keep the design, because their inputs work. In flights without a rudder, the error of p
-    with the design was half of the error under the law.
+    In flights without an elevator, the error of V with the observer was four times the error under
+    the law. The other outputs keep the design, because their inputs work. In flights without a
+    rudder, the error of p with the design was half of the error under the law.
     """
     driven = dict(zip(start.inputs, start.outputs, strict=True))
     return {

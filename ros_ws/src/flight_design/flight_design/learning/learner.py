@@ -351,10 +351,10 @@ class Learner:
     def _adopt(
         self, model: Airframe, known: dict[PartName, Known], dead: dict[PartName, str | None]
     ) -> str | None:
-        """Design a controller for a model, and note it as the last proposal. Raises ParameterError.
+        """Design a controller for a model, and note it as the last proposal.
 
         Returns a sentence on the tracking error that `learn.margin` costs, or None if it costs
-        none.
+        none. Raises ParameterError if no design has the margins.
         """
         proposed, price_text = self._designed(model, known, dead)
         new = [part for part, value in known.items() if value is not self._known.get(part)]
@@ -541,7 +541,7 @@ class Learner:
         """Design the controller for a model, and say what `learn.margin` costs in error.
 
         Parts without a learned model are controlled by the initial law of the flight, or by the
-        rough model's design as long as it is in use. Raises ParameterError.
+        rough model's design as long as it is in use. Raises ParameterError as `_adopt` does.
         """
         start = self._controller
         without_learning = start.model_copy(update={"learn": None})

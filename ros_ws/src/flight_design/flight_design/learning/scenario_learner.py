@@ -98,7 +98,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
             uncertain=False,
             sketched=sketch,
             speeds=speeds,
-            earlier_design=goal.beside,
+            earlier_design=goal.first,
             is_free=goal.is_free,
             activity=ACTIVITY,
         )

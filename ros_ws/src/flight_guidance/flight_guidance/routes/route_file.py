@@ -549,7 +549,7 @@ def _waypoint(key: str, north: float, east: float, altitude: Any, speed: Any = N
 
 
 def _number(key: str, value: Any, name: str, largest: float = 1e9) -> float:
-    """Return a value as a finite number within +-`largest`. Raises ParameterError."""
+    """Return a value as a finite number within +-`largest`, or raise ParameterError."""
     fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
     expected = "a finite number" + (f" from {-largest:g} to {largest:g}" if largest < 1e9 else "")
     require(fits, f"{key}.{name}", "nothing" if value is None else short_repr(value), expected)

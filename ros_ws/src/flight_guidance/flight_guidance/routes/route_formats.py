@@ -43,7 +43,7 @@ def read_places(content: bytes, key: str, suffix: str, line: str | None = None) 
 def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:
     """Read zones and rally points from a QGroundControl plan, a QGC WPL 110 or a GeoJSON file.
 
-    Raises ParameterError.
+    Raises ParameterError if the content cannot be read, or has no zone.
     """
     if suffix in WPL_ENDINGS:
         fence = wpl_fence(content, key)

@@ -16,7 +16,7 @@ from flight_guidance.routes.route_places import A_ROUTE, Geometry, Place, Places
 
 
 def parsed_json(content: bytes, key: str) -> Any:
-    """Parse the content of a JSON file. Raises ParameterError."""
+    """Parse the content of a JSON file. Raises ParameterError if it is not valid JSON."""
     try:
         return json.loads(
             content.removeprefix(b"\xef\xbb\xbf"), object_pairs_hook=_members, parse_int=_whole
@@ -45,7 +45,8 @@ def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def json_route(tree: Any, key: str, line: str | None) -> Places:
     """Read the route in a parsed GeoJSON file.
 
-    `line` chooses one of several lines, see `one_route`. Raises ParameterError.
+    `line` chooses one of several lines, see `one_route`. Raises ParameterError if the file has no
+    route, or more than one without a choice.
     """
     require_wgs84(tree, key)
     geometries: list[Geometry] = []

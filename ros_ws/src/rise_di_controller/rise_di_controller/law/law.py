@@ -301,5 +301,5 @@ CONTROL_LAWS = {sign: _control_law(sign) for sign in Sign}
 
 
 def tuned(params: LawParams) -> TunedLaw:
-    """Return the law RISE-DI together with these parameters, as the controller flies it."""
+    """Return the law RISE-DI together with these parameters, as the controller uses it."""
     return TunedLaw(CONTROL_LAWS[Sign.SOFT if params.sign is None else params.sign], params)
