@@ -103,7 +103,7 @@ def test_only_link_of_autopilot_is_open() -> None:
 
 
 def test_flight_of_autopilot_is_dry_unless_it_told_to_send(tmp_path: Path) -> None:
-    """compose expands the command without variables, except for the scenario.
+    """The command is expanded by compose without variables, except for the scenario.
 
     The command ends at the scenario, which does not exist.
     """

@@ -141,7 +141,7 @@ def test_each_folder_of_tests_is_of_a_package() -> None:
 
 
 def test_pytest_runs_the_tests_of_a_package() -> None:
-    """pytest is run in the folder of a package, with the arguments of `colcon test`."""
+    """The command pytest is run in the folder of a package, with the arguments of `colcon test`."""
     command = [sys.executable, "-m", "pytest", "-o", "cache_dir=cache", "--collect-only", "-qq"]
     done = subprocess.run(
         command, cwd=SOURCES / "flight_recorder", capture_output=True, text=True, check=False
