@@ -163,15 +163,15 @@ def to_fly(
     return f"; fly, {APART:g} s apart, {', then '.join(texts)}" if texts else ""
 
 
-def gust_warning(part: Part) -> str:
-    """Warn that a part of the aircraft was flown in gusts; return "" if the air was calm enough.
+def gust_warning(part: Part) -> str | None:
+    """Warn that a part of the aircraft was flown in gusts, or return None if the air was calm.
 
     A part is a group of states and inputs that does not couple with the rest. The standard
     deviations of its entries do not include the error that gusts cause. In gusts of 0.5 m/s, the
-    effects on a light airplane were identified a fifth too weak.
+    identified effects of a light airplane's inputs were 20 % too weak.
     """
     if part.wind < WINDY:
-        return ""
+        return None
     return (
         f"{', '.join(part.outputs)}: the air moved as in turbulence of {part.wind:g} times "
         "moderate: gusts hide what the inputs do, and their effects may come out a fifth too weak; "
