@@ -335,12 +335,12 @@ def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
 def check_late(case: Case, flight: Flight, window: Window) -> None:
     """Check that the law is engaged, or that u is held if samples came too late.
 
-    If the host held processes back for longer than the hold and the ramp last, u may end at trim. u
-    must not move more than in a steady flight.
+    If the host held processes back until a sample was stale, and for as long as the hold and the
+    ramp last, u may end at trim. u must not move more than in a steady flight.
     """
     ticks = flight.ticks(flight.begin, flight.end + SETTLING)
     allowed = {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
-    if window.host_delay > HOLD + RAMP:
+    if window.host_delay > MAX_AGE + HOLD + RAMP:
         allowed.add(Mode.TRIM)
     assert set(ticks.modes) <= allowed
     assert np.abs(ticks.y).max() <= USUAL
