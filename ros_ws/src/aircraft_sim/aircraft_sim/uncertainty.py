@@ -110,8 +110,8 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
             1 where the published A_ij is 0 or the airframe has no state j
         published       factor_i = 1
 
-    The published effect is the effect of w / V0 or of w, as the file says. If it is minus the
-    published column j, the effect for each aircraft is minus column j of its A.
+    The published effect is the effect of w / V0 or of w, as the file says. If a file
+    has minus column j of its own A as this effect, each aircraft gets minus column j of its A.
     """
     nominal = airframe.matrix_a()
     factors = np.ones((len(A), len(airframe.states), len(airframe.gusts)))

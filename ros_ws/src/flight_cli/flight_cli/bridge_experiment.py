@@ -67,7 +67,7 @@ GUIDED = 600.0  # duration of a flight under guidance, s
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeExperiment:
-    """An experiment on the aircraft behind a channel map, which is flown or read from its log.
+    """An experiment on the aircraft behind a channel map: it is flown, or read from its log.
 
     The results, an airframe and a scenario, are written to `folder`. If the log was imported, the
     gains allow for `link_delay`, s, in addition to the delay in the log. If `link_delay` is None,

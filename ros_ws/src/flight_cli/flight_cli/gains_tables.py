@@ -157,7 +157,7 @@ def _show_margins(console: Console, study: Study, answers: dict[str, Assessment]
 
 
 def _show_verdicts(console: Console, sets: GainSets) -> None:
-    """Print the conditions in parts, each with a verdict. The verdict on the loop decides."""
+    """Print each part of the conditions with a verdict. The verdict on the loop decides."""
     answers = sets.titles
     first = sets.first
     for part, heading in HEADINGS.items():

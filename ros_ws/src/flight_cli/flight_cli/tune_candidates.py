@@ -157,7 +157,7 @@ def best_of(found: Sequence[Candidate], *, accept: bool) -> Candidate:
 
 
 def rms_of_own_loop(own: OwnLoop, selectors: Selectors) -> dict[str, FloatArray]:
-    """Return the rms of y - y_m under the autopilot's own loop, (m,), for each of the airs."""
+    """Return the rms of y - y_m under the autopilot's own loop, (m,), for each kind of air."""
     flight, airframe = selectors.flight, load_airframe(str(selectors.aircraft))
     controller = flight.rise_di()
     errors = {}

@@ -285,7 +285,7 @@ def without_help_word(words: Sequence[str]) -> list[str]:
 
 
 class RiseDiGroup(TyperGroup):
-    """The group of all commands, which refuses a wrong command as options are refused."""
+    """The group of all commands. It refuses a wrong command in the same way as a wrong option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words. Raises ParameterError if an option before the command is unknown."""

@@ -265,8 +265,8 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
     """Yield the samples with stamps by the clock of the autopilot.
 
     The times of arrival cannot serve: a radio may bunch messages, and a second link repeats
-    messages later. A message without a time gets the time of the preceding message on the same
-    link, which is found by the sequence numbers. The stamp of the first message with a time is its
+    messages later. The sequence numbers show which message came before on the same link. A message
+    without a time gets the time of that one. The stamp of the first message with a time is its
     arrival. If no message has a time, or if the clock stands still, each stamp is an arrival.
     """
     with_time = [message for message in messages if hasattr(message.content, "time_boot_ms")]

@@ -100,7 +100,7 @@ def _without_global(
 
 
 def _is_global(node: Node, key: str, arguments: Sequence[str]) -> bool:
-    """Return whether a parameter was given to all nodes, and in no section for this node."""
+    """Return whether a parameter was given only to all nodes together, and not to this node."""
     name = node.get_name()
     is_given = False
     for option, value in pairwise(arguments):

@@ -249,7 +249,7 @@ def answer(
     fleet: int = 0,
     control: bool = False,
 ) -> bytes:
-    """Encode the data that a browser lacks, as a head and the columns of each topic in the head.
+    """Encode the data that a browser lacks: a head, then the columns of each topic that it names.
 
     `fleet` is the number of the data set with the positions of all aircraft, or 0 without a fleet.
     `ghost` says whether there is a second flight for comparison, and `control` whether the page has

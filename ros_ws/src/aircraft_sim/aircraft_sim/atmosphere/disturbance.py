@@ -64,9 +64,9 @@ class Sines(NamedTuple):
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
     """Compute the speeds of the gusts, m/s, (G,): w = U_ds/2 (1 - cos(pi s/H)) up to s = 2H.
 
-    s = V0 ((t - start) mod every). The speed is zero before the entry, and from 2H/V0 seconds after
-    it until the gust is repeated. The derivative is continuous and at most U_ds/2 pi V0/H, which
-    meets Assumption 2. Source of the form: FAR/CS 25.341(a).
+    s = V0 ((t - start) mod every). The speed is zero before the entry. It is zero again 2H/V0
+    seconds after the entry, until the gust is repeated. The derivative is continuous and at most
+    U_ds/2 pi V0/H, which meets Assumption 2. Source of the form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
     since = t - gusts.start
